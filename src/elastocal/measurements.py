@@ -393,6 +393,22 @@ def told_of_rounding(table: Measurements, turning: BoolArray, scatter: Array) ->
 AGREEING, BEYOND_CHANCE = 0.9, 1e-3
 
 
+DAY = 86_400.0  # s
+
+
+def past_midnight(table: Measurements) -> list[str]:
+    """That times which ascend fall back once by half a day or more, as those of a clock do."""
+    fall = -np.diff([] if table.time is None else table.time)
+    back = np.flatnonzero(fall > 0)
+    if len(back) != 1 or not DAY / 2 < fall[back[0]] < DAY:
+        return []
+    return [
+        f"{table.source}: the times fall back by {fall[back[0]] / 3600:.3g} h at line "
+        f"{table.row[back[0] + 1]}, as a clock's do at midnight: add {DAY:g} s from there on, as "
+        "drifts and jumps are looked for in the order of the times"
+    ]
+
+
 def order_contradicted(table: Measurements) -> str | None:
     """That the recorded sides (`approach_1 …`) are not those of the order of the visits, where it
     is so: a table that was split, sorted or thinned, or poses that were overshot."""

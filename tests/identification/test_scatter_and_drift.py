@@ -64,6 +64,9 @@ def test_joints_that_settle_anew_are_told_with_their_size():
 def test_a_drift_is_told_and_whole_blocks_are_left_out():
     finding = (result := identified(drift=DRIFT)).finding("drift")
     assert finding.severity == "care" and "time" in result.noise.kind
+    table = result.observations.table
+    fits = (result, identify(result.model, replace(table, time=(table.time + 85_400) % 86_400)))
+    assert ["at midnight" in "".join(fit.warnings) for fit in fits] == [False, True]
     assert finding.numbers["by"] == "times" and finding.number("lasting_s") > 60
     noise = result.to_json()["noise"]
     assert noise["held_out_by"] == "blocks in time" and noise["drift"]["seconds"] > 60

@@ -66,7 +66,7 @@ from elastocal.identification.mistakes import (
 from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty, named_runs
 from elastocal.identification.scrutiny import BudgetStep, autocorrelation
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
-from elastocal.measurements import Measurements, order_contradicted
+from elastocal.measurements import Measurements, order_contradicted, past_midnight
 from elastocal.messages import (
     ElastocalError,
     InputError,
@@ -238,6 +238,7 @@ def _diagnosed(
             f"measure {FEWEST} at least, better 30 or more"
         )
     table, told = without_copies(table)
+    told = (*told, *past_midnight(table))
     table, left_out = thinned(table)
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")

@@ -72,7 +72,13 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
-from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
+from elastocal.measurements import (
+    NEVER_YET,
+    Measurements,
+    numbered,
+    order_contradicted,
+    past_midnight,
+)
 from elastocal.messages import ElastocalError, InputError, listed, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.base import Parameter
@@ -105,6 +111,7 @@ def identify(
     if test is not None:
         check_rows(model, test, likely_mistake)
     table, told = without_copies(table)
+    told = (*told, *past_midnight(table))
     observed = observe(table, model.observe)
     again = copied(observed)
     copies = tuple(table.row[observed.lead[again]].tolist())
