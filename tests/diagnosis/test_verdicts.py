@@ -70,6 +70,8 @@ def test_a_jump_is_found_by_the_order_of_the_rows() -> None:
     assert (why.verdict, jump.effect, jump.where) == ("explained", "encoder_jump", "joint3")
     assert 98 < jump.settings["jump_time_s"] < 101
     assert why.model_keys == {"clock": "rows"}
+    fit = ec.identify(CASES / "jump_untimed" / "cell.toml", CASES / "jump_untimed" / "train.csv")
+    assert "as after a jump: ask diagnose" in fit.finding("faulty_readings").remedy
 
 
 def test_in_a_sorted_table_a_step_is_no_jump() -> None:

@@ -393,7 +393,8 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
 
 def _faulty(result: Calibration) -> Iterator[Finding]:
     fitted, kept = len(result.observations.lead), len(result.outliers)
-    if n := kept + (gone := len(result.excluded)):
+    many = (gone := len(result.excluded)) > FEW * (fitted + gone)
+    if n := kept + gone:
         remedy = f"Check the {counted(n, 'reading')} beyond the noise."
         shifted = result.faulty_report.shifted if result.faulty_report else []
         if shifted:
@@ -402,12 +403,17 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
                 f"{listed(map(str, shifted), 4)}: look for what "
                 "moved there, a marker or the tracker."
             )
+        if many:
+            lines = [o.line for o in result.excluded]
+            sound = result.observations.table.row[result.observations.lead]
+            if min(lines) > sound.max() or max(lines) < sound.min():
+                remedy += " All stand at one end of the table, as after a jump: ask diagnose."
         numbers = {"left_out": gone, "heldout_all_rms_um": result.heldout_all_rms}
         numbers["shifted"] = sum(len(f.readings) for f in shifted)
         yield _note("faulty_readings", remedy, fitted=kept, **numbers)
     if kept > MANY * fitted:
         yield _care("many_faulty_readings", faulty=kept, fitted=fitted)
-    if gone > FEW * (fitted + gone):
+    if many:
         yield _care("many_left_out", left_out=gone, fitted=fitted)
 
 
