@@ -287,9 +287,10 @@ class _Search:
         self.model, self.observed = every.problem.model, every.problem.observations
         # Functions could follow a shifted block as well, which is no reason to take it back.
         report = course.report() if course.faulty.mean() > FEW else None
-        blocks = report.blocks(self.observed.table) if report else []
-        inside = np.concatenate([[], *(g.readings for g in blocks)])
-        self.shifted = course.faulty & np.isin(np.arange(len(course.faulty)), inside)
+        groups = report.blocks(self.observed.table) if report else []
+        faulty = np.flatnonzero(course.faulty)
+        self.blocks = [np.intersect1d(faulty, g.readings) for g in groups]
+        self.shifted = np.isin(np.arange(len(course.faulty)), np.concatenate([[], *self.blocks]))
         self.functions, self.harmful = Functions(self.model, course.free), list[str]()
         own = np.setdiff1d(sound.problem.free, self.functions.columns)
         problem = replace(sound.problem, free=own, sizes=every.problem.sizes)
@@ -378,6 +379,8 @@ class _Search:
             self.standard[fitted] = fit.standardised()
             if not fitted.all():
                 self.standard[~fitted] = fit.standardised(self.chosen(noise, ~fitted))
+            for block in (b for b in self.blocks if self.shifted[b].any() and not fitted[b].any()):
+                self.shifted[block] = self.stays_shifted(fit, block)
             before, kind = good, None if noise is None else noise.kind
             noise, good = self.judged(noise, good, k)
             good = self.corroborated(fit, noise, fitted, good) & ~self.shifted
@@ -403,6 +406,14 @@ class _Search:
         squared, dof = (e**2).sum(axis=1), max(int(good.sum()) * size, 1)
         limit = squared[good].mean() * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
         return None, np.asarray(squared <= limit)
+
+    def stays_shifted(self, fit: JointFit, block: IntArray) -> bool:
+        """Whether most of a block's shift is there beside functions that were fitted without it.
+        Else the model lacked something where its poses are."""
+        part, at = self.every.problem.part(block), (self.sound.fit.x, fit.found.x)
+        residuals = (part.whitened(x, fit.found.columns)[1].reshape(len(block), -1) for x in at)
+        before, now = (np.linalg.norm(e.mean(axis=0)) for e in residuals)
+        return bool(now > before / 2)
 
     def corroborated(
         self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray, good: BoolArray
