@@ -388,11 +388,6 @@ def told_of_rounding(table: Measurements, turning: BoolArray, scatter: Array) ->
     )
 
 
-# Share of the visits at which a joint that came from one side, by the order of the visits, was
-# recorded as come from there: fewer, beyond chance, and the order is not that of the campaign.
-AGREEING, BEYOND_CHANCE = 0.9, 1e-3
-
-
 DAY = 86_400.0  # s
 
 
@@ -407,6 +402,11 @@ def past_midnight(table: Measurements) -> list[str]:
         f"{table.row[back[0] + 1]}, as a clock's do at midnight: add {DAY:g} s from there on, as "
         "drifts and jumps are looked for in the order of the times"
     ]
+
+
+# Share of the visits at which a joint that came from one side, by the order of the visits, was
+# recorded as come from there: fewer, beyond chance, and the order is not that of the campaign.
+AGREEING, BEYOND_CHANCE = 0.9, 1e-3
 
 
 def order_contradicted(table: Measurements) -> str | None:

@@ -248,23 +248,11 @@ def _diagnosed(
         told = (*told, MISREAD.format(listed(map(str, blocks), 4), int(gone.sum()), len(gone)))
         table = table.take(~gone)
         base = fit_baseline(model, table, options.seed)
-    try:
-        refuse_nonsense(model, base.observed, base.x, base.residual, table)
-    except InsufficientDataError:
-        # Beside readings metres off nothing fits: as in `identify` they go first.
-        if base.problem is None or not (wrong := find_faulty(base.problem, base.x)).any():
-            raise
-        apart = subset(base.observed, wrong)
-        first = base.observed.table.row[base.observed.lead[wrong]]
-        sound = fit_baseline(model, table.take(~np.isin(table.row, first)), options.seed)
-        refuse_nonsense(model, sound.observed, sound.x, sound.residual, table, apart)
-        off = apart.value - model.predict(apart.table, sound.x, apart)
-        far = np.linalg.norm(off.reshape(len(first), -1)[:, :3], axis=1)
-        lines = first[far > POOREST * length_of(model, table)].tolist()
-        table = table.take(~np.isin(table.row, lines))
-        base = fit_baseline(model, table, options.seed)
+    if lines := _far_off(base, table, options.seed):
         runs = listed(named_runs(lines), 8)
         told = (*told, FAR_OFF.format(counted(len(lines), "reading"), runs))
+        table = table.take(~np.isin(table.row, lines))
+        base = fit_baseline(model, table, options.seed)
     if disordered := order_contradicted(table):
         told = (*told, disordered + OUT_OF_ORDER)
         options = replace(options, without=(*options.without, *BY_LAST_MOVE))
@@ -272,16 +260,8 @@ def _diagnosed(
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
-    dataset, found, suspects, few = _few(dataset, options, progress)
-    if some_are_large(found):
-        # What may be of any size is believed to be where it leaves next to nothing open, nor needs
-        # more.
-        large = _few(dataset.of_any_size, options, progress)
-        left, before = (answer.supported.unexplained for answer in (large[3], few))
-        known = large[3].verdict != "unknown_effect" and large[1].chosen.items
-        closed = not large[3].supported.open or left < NEXT_TO_NOTHING * before
-        if known and closed and len(known) <= max(len(found.chosen.items), 1):
-            dataset, found, suspects, few = large
+    few, suspects = _few_causes(dataset, options, progress)
+    dataset, found = few.before, few.selected
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
     tests, answer = structure_tests(found.first), whole or few
@@ -339,16 +319,24 @@ def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup
     return []
 
 
-NEXT_TO_NOTHING = 0.1
-
-
-def _few(
-    dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, ForwardSelection, BoolArray, FewAnswer]:
-    dataset, found, suspects = _searched(dataset, options, progress)
-    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
-    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
-    return dataset, found, suspects, few
+def _far_off(base: Baseline, table: Measurements, seed: int) -> list[int]:
+    """Lines of readings that no arm could give: beside some that are metres off nothing fits, and
+    as in `identify` they go first.  Raises InsufficientDataError where nothing fits without them.
+    """
+    model = base.model
+    try:
+        refuse_nonsense(model, base.observed, base.x, base.residual, table)
+    except InsufficientDataError:
+        if base.problem is None or not (wrong := find_faulty(base.problem, base.x)).any():
+            raise
+        apart = subset(base.observed, wrong)
+        first = base.observed.table.row[base.observed.lead[wrong]]
+        sound = fit_baseline(model, table.take(~np.isin(table.row, first)), seed)
+        refuse_nonsense(model, sound.observed, sound.x, sound.residual, table, apart)
+        off = apart.value - model.predict(apart.table, sound.x, apart)
+        far = np.linalg.norm(off.reshape(len(first), -1)[:, :3], axis=1)
+        return first[far > POOREST * length_of(model, table)].tolist()
+    return []
 
 
 def _sum_of_all(
@@ -428,10 +416,29 @@ def _pieces(
     }
 
 
+NEXT_TO_NOTHING = 0.1
+
+
+def _few_causes(
+    dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
+) -> tuple[FewAnswer, BoolArray]:
+    """The answer by few causes, and suspects (N,) that stay.  What may be of any size is believed
+    to be where it leaves next to nothing open, nor needs more."""
+    usual = few, _ = _searched(dataset, options, progress)
+    if not some_are_large(few.before, few.selected.nothing):
+        return usual
+    wide = large, _ = _searched(few.before.of_any_size, options, progress)
+    left, before = (answer.supported.unexplained for answer in (large, few))
+    known = large.verdict != "unknown_effect" and large.selected.chosen.items
+    closed = not large.supported.open or left < NEXT_TO_NOTHING * before
+    few_enough = known and len(known) <= max(len(few.selected.chosen.items), 1)
+    return wide if closed and few_enough else usual
+
+
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, ForwardSelection, BoolArray]:
-    """What is missing, the data without the faulty readings, which are sought twice, since beside
+) -> tuple[FewAnswer, BoolArray]:
+    """What is missing in the data without the faulty readings, which are sought twice, since beside
     a large effect nothing looks faulty, or the wrong readings do, and suspects (N,) that stay."""
 
     def search_without(faulty: BoolArray) -> ForwardSelection:
@@ -448,4 +455,6 @@ def _searched(
         if (faulty != before).any():
             progress("searching again without outliers")
             found = search_without(faulty)
-    return dataset.without(faulty), found, suspects
+    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
+    few = FewAnswer(dataset.without(faulty), found.dataset, total, (), rng, {}, found)
+    return few, suspects

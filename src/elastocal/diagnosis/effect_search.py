@@ -423,9 +423,8 @@ def about(
 LARGE = 5.0  # nats by which an effect has to be likelier where it may be of any size
 
 
-def some_are_large(found: ForwardSelection) -> bool:
+def some_are_large(dataset: DiagnosisData, nothing: ModelSet) -> bool:
     """Whether an effect that may be of any size is likelier to be far larger than usual."""
-    nothing, dataset = found.nothing, found.before
     grams = Grams(dataset, nothing.data, nothing.at)
     for h in (h for h in dataset.hypotheses if h.effect.any_size):
         usual, large = (grams.of(h).evidence(s).max() for s in (h.scales, ANY_SCALES))
@@ -476,7 +475,6 @@ class ForwardSelection:
         self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
     ) -> None:
         self.dataset, self.generic, self._fitted = dataset, generic, dict[tuple, ModelSet]()
-        self.before = dataset
         flips = FLIPS, len(dataset.blocks.member)
         self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)
