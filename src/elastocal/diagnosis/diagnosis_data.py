@@ -87,11 +87,6 @@ class DiagnosisData:
         return replace(self, hypotheses=tuple(wide))
 
     @property
-    def turning(self) -> BoolArray:
-        """Which joints are revolute."""
-        return np.array([kind == "revolute" for kind in self.base.model.chain.kinds])
-
-    @property
     def lead(self) -> IntArray:
         """Row (N,) of the table that each observation stands in first."""
         return self.base.observed.lead

@@ -228,7 +228,7 @@ class SupportedFloor:
         smooth = np.minimum(smooth_scatter(dataset, data, self.at), scatter)
         above, excess = 0.0, np.zeros_like(scatter)
         if data.stated:  # else what joints do and what the instrument does are not to be told apart
-            rounding = rounded_joints(dataset.table, dataset.turning)
+            rounding = rounded_joints(dataset.table, dataset.base.model.chain.turning)
             excess = scatter_beyond(noise, rounding[0] if rounding else 0.0)
             smooth = np.maximum(smooth, excess)
             above = max(noise.factor**2 - MOST_STATED**2, 0.0)

@@ -355,8 +355,9 @@ def warnings(
     data = found.chosen.data
     if data.stated:
         yield from _stated_wrong(dataset, data, noise)
-    scatter = np.array(noise.repeatability)[dataset.turning]
-    if told := told_of_rounding(dataset.table, dataset.turning, scatter):
+    turning = dataset.base.model.chain.turning
+    scatter = np.array(noise.repeatability)[turning]
+    if told := told_of_rounding(dataset.table, turning, scatter):
         yield told[0].lower() + told[1:].removesuffix(".")
     if (faulty := data.faulty.mean()) > FAULTY_SHARE:
         yield (

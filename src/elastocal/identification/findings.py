@@ -235,8 +235,9 @@ def _state_noise(result: Calibration) -> str:
 
 def _rounded(result: Calibration) -> str | None:
     scatter = np.array([s.sigma for s in result.noise.sizes or () if s.joints and s.sigma])
-    turning = np.array([kind == "revolute" for kind in result.model.chain.kinds])
-    return told_of_rounding(result.observations.table, turning, scatter) if len(scatter) else None
+    if not len(scatter):
+        return None
+    return told_of_rounding(result.observations.table, result.model.chain.turning, scatter)
 
 
 def _lacking(result: Calibration) -> str:

@@ -272,7 +272,7 @@ def joint_maps(chain: Chain) -> list[JointMap]:
         for factor in (1.0, -1.0) if kinds[j] == kinds[j - 1] else ():
             told = f"with coupling {{ joint = {j + 1}, of = {j}, factor = {factor:g} }}"
             couplings.append(JointMap((told,), eye + factor * np.outer(eye[j], eye[j - 1])))
-    turning = np.array([kind == "revolute" for kind in kinds])
+    turning = chain.turning
     for factor, told in ((np.pi / 180, "degrees read as radians"),
                          (180 / np.pi, "radians read as degrees")):  # fmt: skip
         scale = np.diag(np.where(turning, factor, 1.0))
@@ -312,8 +312,7 @@ def _geared(chain: Chain, table: Measurements) -> Iterator[JointMap]:
         flange = flange.reshape(*q.shape[:2], 4, 4)
         return LinearFits(flange, np.asarray(table.position), table.marker).left
 
-    moved = np.ptp(table.q, axis=0) > 0
-    for j in [j for j, kind in enumerate(chain.kinds) if kind == "revolute" and moved[j]]:
+    for j in np.flatnonzero(chain.turning & (np.ptp(table.q, axis=0) > 0)).tolist():
         tried = np.concatenate([FACTORS, -FACTORS, [np.pi / 180, 180 / np.pi]])
         best = float(tried[np.argmin(left(j, tried))])
         for step in (2e-2, 5e-3, 1e-3):

@@ -440,8 +440,7 @@ def check_rows(model: Model, table: Measurements, mistake: Mistake) -> None:
 
 
 def check_limits(model: Model, table: Measurements, mistake: Mistake | None = None) -> None:
-    revolute = np.array([k == "revolute" for k in model.chain.kinds])
-    wound = np.abs(table.q[:, revolute]) > 4 * np.pi
+    wound = np.abs(table.q[:, model.chain.turning]) > 4 * np.pi
     if wound.any():
         (i, *more), remedy = np.flatnonzero(wound.any(axis=1)).tolist(), "correct the line"
         if 2 * len(more) >= len(table) - 1:

@@ -12,7 +12,7 @@ import numpy as np
 
 from elastocal.cell import Cell
 from elastocal.messages import InputError, check_known, listed, printable, require, rounded, wish
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 JointKind = Literal["revolute", "prismatic"]
 
@@ -69,6 +69,11 @@ class Chain:
     def kinds(self) -> tuple[JointKind, ...]:
         return tuple(joint.kind for joint in self.joints)
 
+    @property
+    def turning(self) -> BoolArray:
+        """Which joints (n,) are revolute."""
+        return np.array([kind == "revolute" for kind in self.kinds], dtype=bool)
+
 
 # Joint limits: the robot's own, narrowed by the cell's.
 
@@ -93,7 +98,7 @@ def finite_ranges(
     """Ranges (n,) to draw joint values from: the limits, and where there are none, a turn (2 m
     for a prismatic joint) from the one limit, or about `near` (n,), by default about zero.  A
     limit beyond `NO_LIMIT` such half turns (1 m) from there is none: files write 1e16 for it."""
-    half = np.where([kind == "revolute" for kind in chain.kinds], np.pi, 1.0)
+    half = np.where(chain.turning, np.pi, 1.0)
     centre = np.zeros(len(lower)) if near is None else near
     lower = np.where(lower < centre - NO_LIMIT * half, -np.inf, lower)
     upper = np.where(upper > centre + NO_LIMIT * half, np.inf, upper)

@@ -398,5 +398,5 @@ def unwound(chain: Chain, q: Array, near: Array, lower: Array, upper: Array) -> 
     turns = np.round((near - q) / turn)
     # Rounded inwards a little less, so that a joint at its limit stays where it is.
     fewest, most = np.ceil((lower - q) / turn - 1e-12), np.floor((upper - q) / turn + 1e-12)
-    turns = np.where([kind == "revolute" for kind in chain.kinds], turns, 0.0)
+    turns = np.where(chain.turning, turns, 0.0)
     return np.asarray(np.clip(q + turn * np.clip(turns, fewest, most), lower, upper))

@@ -590,7 +590,7 @@ class _Ordering:
         rules, pool = self.rules, self.search.pool
         chain, home = rules.chain, rules.cell.design.motion.home
         lower, upper = finite_ranges(chain, *joint_limits(rules.cell, chain))
-        turn = np.where([kind == "revolute" for kind in chain.kinds], 2 * np.pi, np.inf)
+        turn = np.where(chain.turning, 2 * np.pi, np.inf)
         q = pool.q - np.nan_to_num(
             turn * np.round((pool.q - ((lower + upper) / 2 if home is None else home)) / turn)
         )
