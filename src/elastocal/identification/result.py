@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
@@ -138,12 +138,19 @@ class Combination:
     @property
     def expression(self) -> str:
         """The sum as it was determined: "joint2.offset + 0.5·(link1.rz - 0.001)"."""
-        first, *rest = self.terms.items()
-        text = first[0]
-        for name, factor in rest:
-            number = rounded(abs(factor), 4)
-            size = "" if number == "1" else f"{number}·"
-            text += f" {'-' if factor < 0 else '+'} {size}{deviation(name, self.held.get(name))}"
+        return self.sum_of(self.terms, lambda factor: rounded(factor, 4), 6)
+
+    def sum_of(self, names: Collection[str], size: Callable[[float], str], digits: int) -> str:
+        """The first member and, of the others, those of these `names`."""
+        first, *rest = self.terms
+        text = first
+        for name in (name for name in rest if name in names):
+            number = size(abs(factor := self.terms[name]))
+            number = "" if float(number) == 1 else f"{number}·"
+            member, held = name, self.held.get(name)
+            if held:  # as its deviation from there
+                member = f"({name} {'-' if held > 0 else '+'} {abs(held):.{digits}g})"
+            text += f" {'-' if factor < 0 else '+'} {number}{member}"
         return text
 
     def to_json(self) -> dict[str, Any]:
@@ -162,13 +169,6 @@ def with_std(value: float, std: float) -> str:
     digits = max(power - math.floor(math.log10(std)) + 1, 1)
     shown = f"{value / 10.0**power:.{digits}f} ± {std / 10.0**power:.{digits}f}"
     return f"({shown})e{power:+03d}"
-
-
-def deviation(name: str, held: float | None, digits: int = 6) -> str:
-    """A parameter as its deviation from where it is held: "(link1.rz - 0.001)"; plain from 0."""
-    if not held:
-        return name
-    return f"({name} {'-' if held > 0 else '+'} {abs(held):.{digits}g})"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from elastocal.identification import findings
 from elastocal.identification.findings import next_steps
 from elastocal.identification.prediction import PredictedError
-from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
+from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.messages import listed, option, printable, some
 from elastocal.model.calibrated import mostly_prior
@@ -57,14 +57,14 @@ def calibration_blocks(
     yield parameter_table(result, truth, published)
     if result.combinations:
         told = "Combinations that are determined although their members are not"
-        yield _open_if_few(combination_table(result, truth), told)
-        whole = [(shortened(c, len(c.terms)), shortened(c)) for c in result.combinations]
-        longer = [say.Sentence(every) for every, some in whole if every != some]
+        names = [shortened(c) for c in result.combinations]
+        title = "Combinations (factors in SI units)"
+        yield _open_if_few(_numbers(title, names, result.combinations, {}), told)
+        whole = [shortened(c, len(c.terms)) for c in result.combinations]
+        longer = [say.Sentence(every) for every in whole if every not in names]
         yield say.Fold("Combinations with all their members", lambda: longer)
     for line in undetermined_lines(result, FEW):
         yield say.Sentence(say.sentence(line), soft=True)
-    hit, n = coverage(result, truth) if truth else (0, 0)
-    held = f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
     yield say.Lines([
         ("Readings", readings(result)),
         ("Identified", what_was_identified(result)),
@@ -72,7 +72,7 @@ def calibration_blocks(
         ("Noise", words.does_noise_explain_it(result)),
         ("Constraints", words.constraints_line(result)),
         ("Prior", words.prior_line(result)),
-        ("Truth", held if truth else None),
+        ("Truth", coverage(result, truth)),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
     residuals = cache(lambda: Residuals(result.model, result.observations, result.residual))
@@ -340,15 +340,10 @@ def _influence_table(result: Calibration) -> say.ShownTable:
 
 def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     """The first member and the largest other terms by factor, "+ n more" for the rest."""
-    (first, _), *rest = combination.terms.items()
+    rest = list(combination.terms.items())[1:]
     # Of factors that are alike but for rounding the first ones are told, on any machine.
-    kept = sorted(rest, key=lambda term: -float(f"{abs(term[1]):.6g}"))[: most - 1]
-    text = printable(first)
-    for name, factor in [term for term in rest if term in kept]:
-        size = say.significant(abs(factor))
-        number = "" if float(size) == 1 else f"{size}·"
-        member = deviation(printable(name), combination.held.get(name), 4)
-        text += f" {'-' if factor < 0 else '+'} {number}{member}"
+    kept = dict(sorted(rest, key=lambda term: -float(f"{abs(term[1]):.6g}"))[: most - 1])
+    text = printable(combination.sum_of(kept, say.significant, 4))
     more = len(rest) - len(kept)
     return f"{text} + {more} more" if more else text
 
@@ -381,24 +376,18 @@ def limits(result: Calibration, e: Estimate) -> str:
     return f"{text}; {used} is used"
 
 
-def combination_truth(result: Calibration, combination: Combination, truth: Truth) -> float | None:
-    """True value X_k + Σ f·(X_d − held_d), None where a member's true value is not known."""
-    (first, _), *rest = combination.terms.items()
-    if any(name not in truth for name in combination.terms):
-        return None
-    return truth[first] + sum(f * (truth[name] - result[name].held) for name, f in rest)
-
-
 def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
     if value is None or ci95 is None:
         return ""
     return "inside" if ci95[0] <= value <= ci95[1] else "outside"
 
 
-def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
+def coverage(result: Calibration, truth: Truth | None) -> str | None:
+    if not truth:
+        return None
     found = [inside(truth.get(e.name), e.ci95) for e in result.ordinary]
-    found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
-    return found.count("inside"), len(found) - found.count("")
+    hit, n = found.count("inside"), len(found) - found.count("")
+    return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
 
 
 def stated(parameter: Parameter) -> bool:
@@ -436,14 +425,13 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> Iterator
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
-    heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
     rows, standing = list[tuple[str, ...]](), findings.standings(result)
     redundant = result.left.redundant if result.left else ()
     known = {p.name: p for p in result.model.parameters}
     for e in result.ordinary:
-        if e.identifiable:
+        kind, name = standing[e.name], printable(e.name)
+        if kind == findings.ALONE:
             continue
-        kind, why = standing[e.name], printable(e.note)
         if kind == findings.COMBINED:
             why = f"only as {shortened(result.combination(e.name))}"
         elif kind == findings.ABSORBED:
@@ -453,39 +441,38 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.S
         elif kind == findings.INVISIBLE:
             why = f"held{HELD[REDUNDANT if e.name in redundant else kind]}"
         else:
-            why = WITHOUT.get(kind, why)
+            why = WITHOUT[kind]
+        *_, unit, true = texts(e, truth.get(e.name) if truth else None)
         nominal = nominal_text(e, known[e.name])
-        true = [texts(e, truth.get(e.name))[3]] if truth else []
-        rows.append((printable(e.name), nominal, say.display(0.0, e.unit)[1], *true, why))
-    return say.ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
+        rows.append((name, nominal, unit, *([true] if truth else []), why))
+    heads = ("parameter", "nominal", "unit", *(["truth"] if truth else []), "why")
+    return say.ShownTable(heads, rows, (0, 2, len(heads) - 1))
 
 
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
     """Value, half width or both ends, unit and true value; "–" for what is not determined."""
+    shown, unit = say.display(true or 0.0, e.unit)
     if e.value is None or e.ci95 is None:
-        known = "–" if true is None else say.plain(say.display(true, e.unit)[0])
-        return "–", "–", say.display(0.0, e.unit)[1], known
-    if is_lopsided(e.value, e.ci95):
-        shown, low, high = (say.display(number, e.unit)[0] for number in (e.value, *e.ci95))
-        value, half, width = say.with_ends(shown, low, high)
-        unit = say.display(e.value, e.unit)[1]
-    else:
-        width = (e.ci95[1] - e.ci95[0]) / 2
-        value, half, unit = say.estimate(e.value, width, e.unit)
-        width = say.display(width, e.unit)[0]
-    known = "–" if true is None else say.with_uncertainty(say.display(true, e.unit)[0], width)[0]
-    return value, half, unit, known
+        return "–", "–", unit, "–" if true is None else say.plain(shown)
+    value, low, high = (say.display(number, e.unit)[0] for number in (e.value, *e.ci95))
+    width = (high - low) / 2
+    text, half = say.with_uncertainty(value, width)
+    if is_lopsided(e):
+        text, half, width = say.with_ends(value, low, high)
+    return text, half, unit, "–" if true is None else say.with_uncertainty(shown, width)[0]
 
 
+HOLDS = "in 95 %"
 ROUNDING = 1e-9  # sides of an interval this short beside the value are alike
 
 
-def is_lopsided(value: float, ci95: tuple[float, float]) -> bool:
+def is_lopsided(e: Estimate | Combination) -> bool:
     """Not symmetric, or without an end: both ends are to be told."""
-    below, above = value - ci95[0], ci95[1] - value
+    assert e.value is not None and e.ci95 is not None
+    below, above = e.value - e.ci95[0], e.ci95[1] - e.value
     if not (math.isfinite(below) and math.isfinite(above)):
         return True
-    return abs(above - below) > max(LOPSIDED * max(above, below), ROUNDING * abs(value))
+    return abs(above - below) > max(LOPSIDED * max(above, below), ROUNDING * abs(e.value))
 
 
 def parameter_table(
@@ -493,48 +480,44 @@ def parameter_table(
 ) -> say.ShownTable:
     own = [e for e in result.ordinary if e.identifiable]
     known = {p.name: p for p in result.model.parameters}
+    more: dict[str, list[str]] = {}
+    if truth:
+        true = [truth.get(e.name) for e in own]
+        more["truth"] = [texts(e, value)[3] for e, value in zip(own, true, strict=True)]
+        more[HOLDS] = [inside(value, e.ci95) for e, value in zip(own, true, strict=True)]
     nominal = [nominal_text(e, known[e.name]) for e in own]
-    after = {} if set(nominal) <= {"–"} else {"nominal": nominal}
+    if not set(nominal) <= {"–"}:
+        more["nominal"] = nominal
     if published:
         given = [(published.get(e.name), e.unit) for e in own]
-        after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])
-                              for v, unit in given]  # fmt: skip
+        more["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])
+                             for v, unit in given]  # fmt: skip
     mostly = mostly_prior(result.prior_share)
     notes = [printable(e.note) or "mostly prior" * (e.name in mostly) for e in own]
     if any(notes):
-        after["note"] = notes
-    true = None if truth is None else [truth.get(e.name) for e in own]
-    table = _numbers("Parameters", [printable(e.name) for e in own], own, true, after)
+        more["note"] = notes
     of = [known[e.name].effect.replace("_", " ") for e in own]
     groups = {k: name for k, name in enumerate(of) if not k or name != of[k - 1]}
+    table = _numbers("Parameters", [printable(e.name) for e in own], own, more)
     return replace(table, groups=groups)
-
-
-def combination_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
-    found = result.combinations
-    true = None if truth is None else [combination_truth(result, c, truth) for c in found]
-    return _numbers("Combinations (factors in SI units)", [*map(shortened, found)], found, true, {})
 
 
 def _numbers(
     title: str, names: list[str], found: Sequence[Estimate | Combination],
-    truth: list[float | None] | None, after: dict[str, list[str]],
+    more: dict[str, list[str]],
 ) -> say.ShownTable:  # fmt: skip
-    lopsided = any(
-        e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
-    )
+    """With `more` columns, of which a narrow terminal has whether the interval holds the truth."""
+    lopsided, held = any(map(is_lopsided, found)), more.get(HOLDS)
     first, half = title.split()[0].lower().removesuffix("s"), "95 %" if lopsided else "± 95 %"
-    of_truth = ["truth", "in 95 %"] if truth else []
-    heads = (first, "value", half, "unit", *of_truth, *after)
     rows, brief = [], []
     for k, e in enumerate(found):
-        at = truth[k] if truth else None
-        value, width, unit, known = texts(e, at)
-        signed = width if width.startswith(("[", "–")) else f"± {width}"
-        held = [inside(at, e.ci95)] if truth else []
-        rest = [*([known, *held] if truth else []), *(own[k] for own in after.values())]
-        rows.append((names[k], value, signed if lopsided else width, unit, *rest))
-        brief.append((names[k], f"{value} {signed} {unit}", *held))
-    words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", "in 95 %", "note"))
-    narrow = say.ShownTable((first, f"value {half}", *of_truth[1:]), brief, (0, 1, 2), title=title)
+        value, width, unit, _ = texts(e, None)
+        signed = width if width.startswith("[") else f"± {width}"
+        beside = [column[k] for column in more.values()]
+        rows.append((names[k], value, signed if lopsided else width, unit, *beside))
+        brief.append((names[k], f"{value} {signed} {unit}", *([held[k]] if held else [])))
+    heads = (first, "value", half, "unit", *more)
+    words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", HOLDS, "note"))
+    few = (first, f"value {half}", *([HOLDS] if held else []))
+    narrow = say.ShownTable(few, brief, (0, 1, 2), title=title)
     return say.ShownTable(heads, rows, words, title=title, narrow=narrow)
