@@ -161,7 +161,11 @@ def _method(result: Calibration) -> Iterator[say.Block]:
 def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
     if budget is not None:
         yield say.budget_table(*budget_steps(result, budget))
-    yield spread_table(before_and_after(result, budget), "readings")
+    found = before_and_after(result, budget)
+    lengths = {name: np.linalg.norm(errors, axis=1) for name, errors in found.items()}
+    if result.test is not None and len(result.test.errors):
+        lengths["calibrated, test data"] = result.test.errors
+    yield spread_table(lengths, "readings", "Before and after")
 
 
 def _outliers(result: Calibration) -> Iterator[say.Block]:
@@ -296,19 +300,14 @@ def budget_steps(result: Calibration, budget: ErrorBudget) -> say.Budget:
 
 
 def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[str, Array]:
-    """Length (n,) in m of the errors, in poses that were not fitted and on test data."""
-    found = {}
-    if budget is not None and len(budget.steps) > 1:
-        ends = {nominal_held_out(result): budget.steps[0], "calibrated": budget.steps[-1]}
-        found = {name: np.linalg.norm(step.errors, axis=1) for name, step in ends.items()}
-    if result.test is not None and len(result.test.errors):
-        found["calibrated, test data"] = result.test.errors
-    return found
+    """Errors (n, 3) in m of the nominal and the calibrated arm in poses that were not fitted."""
+    if budget is None or len(budget.steps) < 2:
+        return {}
+    ends = budget.steps[0].errors, budget.steps[-1].errors
+    return dict(zip((nominal_held_out(result), "calibrated"), ends, strict=True))
 
 
-def spread_table(
-    found: dict[str, Array], count: str, title: str = "Before and after"
-) -> say.ShownTable:
+def spread_table(found: dict[str, Array], count: str, title: str) -> say.ShownTable:
     rows = []
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())

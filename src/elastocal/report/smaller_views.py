@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from string import Template
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -407,7 +407,7 @@ FEWEST = 3  # readings of one place from which on a repeatability is told
 
 def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
-    certified = certified_values(result, budget)
+    certified = Certified(result, budget)
     yield judgement(result)
     told = [
         (name.replace("_", " "), printable(value))
@@ -427,7 +427,7 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         yield say.Heading("Statement of conformity")
         yield say.Sentence(certified.conformity(entries.limit))
     yield from _uncertainty(certified)
-    yield from _poses(result, budget, certified)
+    yield from _poses(result, budget)
     stated = result.model.cell.tracker.noise
     noise = "none stated" if result.observations.table.sigma is None else "stated with each reading"
     if stated is not None:
@@ -453,56 +453,49 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     yield say.ShownTable(("what", ""), say.Lines(facts).items, (0, 1), title=title)
 
 
-@dataclass(frozen=True)
 class Certified:
-    """What the certificate and its XML state, lengths in m.  `sources`: standard uncertainty of a
-    coordinate by source (name, GUM's type, u), of the distance where distances were read; their
-    root sum of squares is that of what the calibrated model predicts against one reading.
-    `coordinates`: how many a reading has, 3 or 1.  `error`: the largest distance between places
-    meant and read, of `places` that were not fitted.  `repeatability`: RP of the places read often
-    enough."""
+    """What the certificate and its XML state, lengths in m.
 
-    sources: tuple[tuple[str, str, float], ...]
-    error: float | None
-    places: str
-    repeatability: Array
-    coordinates: int = 3
+    `sources`: standard uncertainty of a coordinate by source (name, GUM's type, u), of the distance
+    where distances were read; their root sum of squares is that of what the calibrated model
+    predicts against one reading.  `coordinates`: how many a reading has, 3 or 1.  `error`: the
+    largest distance between places meant and read, of `places` that were not fitted; or NaN.
+    """
 
-    @property
-    def quantity(self) -> str:
-        return "position" if self.coordinates == 3 else "distance"
-
-    @property
-    def expanded(self) -> float:
-        """U = k·√(Σ u²) of a coordinate."""
-        return K * math.sqrt(sum(u**2 for *_, u in self.sources))
-
-    @property
-    def of_deviations(self) -> float:
-        """Of reading and instrument alone, since the arm's own errors are what is measured."""
-        own = [u for name, _, u in self.sources if name in (READING, INSTRUMENT)]
-        return K * math.sqrt(self.coordinates * sum(u**2 for u in own))
+    def __init__(self, result: Calibration, budget: ErrorBudget | None) -> None:
+        parts, own = result.uncertainty(), result.model.cell.certificate.instrument_uncertainty
+        self.coordinates = 1 if result.observations.kind == "distance" else 3
+        self.sources = [
+            (name, kind, getattr(parts, key) / math.sqrt(self.coordinates))
+            for key, (name, kind) in ({} if parts is None else PARTS).items()
+        ]
+        if own is not None:
+            self.sources.append((INSTRUMENT, "B", own / K))
+        # Of reading and instrument alone, since the arm's own errors are what is measured.
+        alone = [u for name, _, u in self.sources if name in (READING, INSTRUMENT)]
+        self.of_deviations = K * math.sqrt(self.coordinates * sum(u**2 for u in alone))
+        self.error, self.places = math.nan, "each place left out of the fit"
+        if result.test is not None and len(result.test.errors):
+            self.error, self.places = float(result.test.errors.max()), "test data"
+        elif budget is not None:
+            apart = pose_accuracy(result.observations, budget.steps[-1].errors)
+            self.error = float(apart.max())
 
     def conformity(self, limit: float) -> str:
         """The decision by ISO 14253-1, with a guard band of one expanded uncertainty."""
-        if self.error is None:
-            return (
-                f"No statement: no {self.quantity} error was measured at places that were not "
-                "fitted."
-            )
-        guard = self.of_deviations
-        numbers = (
-            f"largest {self.quantity} error {say.length(self.error)} ({self.places}), "
-            f"limit {say.length(limit)}, guard band {say.length(guard)} (U, k = 2, of a "
-            "measured distance)"
-        )
+        what, guard = "position" if self.coordinates == 3 else "distance", self.of_deviations
+        if math.isnan(self.error):
+            return f"No statement: no {what} error was measured at places that were not fitted."
+        text = "No statement: the limit lies within the guard band of the error"
         if self.error + guard <= limit:
             text = "Conforms: the error and its guard band are within the limit"
         elif self.error - guard > limit:
             text = "Does not conform: the error exceeds the limit by more than its guard band"
-        else:
-            text = "No statement: the limit lies within the guard band of the error"
-        return f"{text}. Decision rule of ISO 14253-1: {numbers}."
+        return (
+            f"{text}. Decision rule of ISO 14253-1: largest {what} error {say.length(self.error)} "
+            f"({self.places}), limit {say.length(limit)}, guard band {say.length(guard)} (U, k = "
+            "2, of a measured distance)."
+        )
 
 
 READING, INSTRUMENT = "reading", "calibration of the instrument"
@@ -514,23 +507,6 @@ PARTS = {
     "lack_of_fit": ("model: lack of fit", "A"),
     "open_parameters": ("choice of parameters: those left open", "B"),
 }
-
-
-def certified_values(result: Calibration, budget: ErrorBudget | None) -> Certified:
-    parts, sources = result.uncertainty(), []
-    coordinates = 1 if result.observations.kind == "distance" else 3
-    for key, (name, kind) in PARTS.items() if parts is not None else ():
-        sources.append((name, kind, getattr(parts, key) / math.sqrt(coordinates)))
-    own = result.model.cell.certificate.instrument_uncertainty
-    if own is not None:
-        sources.append((INSTRUMENT, "B", own / K))
-    error, places = None, ""
-    if result.test is not None and len(result.test.errors):
-        error, places = float(result.test.errors.max()), "test data"
-    elif budget is not None:
-        apart = pose_accuracy(result.observations, budget.steps[-1].errors)
-        error, places = float(apart.max()), "each place left out of the fit"
-    return Certified(tuple(sources), error, places, pose_repeatability(result), coordinates)
 
 
 def pose_repeatability(result: Calibration) -> Array:
@@ -549,36 +525,30 @@ def pose_repeatability(result: Calibration) -> Array:
 
 
 def _uncertainty(certified: Certified) -> Iterator[say.Block]:
-    if not certified.sources:
+    if not (sources := certified.sources):
         return
-    square = sum(u**2 for *_, u in certified.sources)
+    square = sum(u**2 for *_, u in sources)
     rows = [
         (name, kind, say.length(u), f"{100 * u**2 / square if square else 0:.0f} %")
-        for name, kind, u in certified.sources
+        for name, kind, u in sources
     ]
     rows.append(("combined", "", say.length(math.sqrt(square)), "100 %"))
-    rows.append(("expanded, U with k = 2", "", say.length(certified.expanded), ""))
+    rows.append(("expanded, U with k = 2", "", say.length(K * math.sqrt(square)), ""))
     heads = ("source", "type", "standard uncertainty", "share of the variance")
     of_what = "coordinate of a position" if certified.coordinates == 3 else "distance"
     note = (
         f"Of a {of_what} that the calibrated model predicts, against one reading (GUM, JCGM 100). "
         "U covers about 95 %."
     )
-    if all(name != INSTRUMENT for name, *_ in certified.sources):
+    if all(name != INSTRUMENT for name, *_ in sources):
         note += " Without the instrument's own calibration, which [certificate] does not state."
     yield say.ShownTable(heads, rows, (0, 1), title="Uncertainty", note=note)
 
 
-def _poses(
-    result: Calibration, budget: ErrorBudget | None, certified: Certified
-) -> Iterator[say.Block]:
-    if budget is not None and len(budget.steps) > 1:
-        ends = (budget.steps[0], budget.steps[-1])
-        found = {
-            name: pose_accuracy(result.observations, step.errors)
-            for name, step in zip(fitted.before_and_after(result, budget), ends, strict=False)
-        }
-        yield fitted.spread_table(found, "places", "Pose accuracy before and after")
+def _poses(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
+    if found := fitted.before_and_after(result, budget):
+        apart = {name: pose_accuracy(result.observations, e) for name, e in found.items()}
+        yield fitted.spread_table(apart, "places", "Pose accuracy before and after")
         yield say.Sentence(
             "In the sense of ISO 9283: the distance between the place that was meant and the mean "
             "of what was read there, at every configuration, marker and load. “Calibrated” is what "
@@ -591,7 +561,7 @@ def _poses(
         yield say.Sentence(
             "Pose accuracy is not known: no configuration can be left out of the fit."
         )
-    if len(rp := certified.repeatability):
+    if len(rp := pose_repeatability(result)):
         yield say.Sentence(
             f"Pose repeatability RP (ISO 9283): {say.length(float(rp.mean()))} in the mean of "
             f"{len(rp)} places read {FEWEST} times or more, {say.length(float(rp.max()))} at most; "
@@ -630,7 +600,7 @@ def dcc_text(result: Calibration) -> str:
             "a digital calibration certificate needs [certificate] in the cell with "
             f"{listed(c.missing)}; without them write the report as .html"
         )
-    certified = certified_values(result, gap_budget(result))
+    certified = Certified(result, gap_budget(result))
     statement, u = judgement(result).sentence, certified.of_deviations
     if c.limit is not None:
         statement = f"{certified.conformity(c.limit)} {statement}"
@@ -666,6 +636,6 @@ def _xml(text: str) -> str:
 
 def _quantity(name: str, value: float | None, unit: str, expanded: float | None = None) -> str:
     what, name = "<dcc:noQuantity/>", _xml(name)
-    if value is not None:
+    if value is not None and math.isfinite(value):
         what = REAL % (value, unit, "" if expanded is None else COVERED % (expanded, K))
     return QUANTITY % (name, name, what)
