@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from html import escape
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Cell, HalfSpace, Solid
+from elastocal.cell import Cell, Solid
 from elastocal.files import atomic_write
 from elastocal.measurements import numbered
 from elastocal.messages import ElastocalError, load_text, printable, require
@@ -22,6 +22,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.planning.collision import (
+    Body,
     Kinematics,
     cell_bodies,
     hull,
@@ -57,44 +58,36 @@ class Shell:
     name: str = ""
 
 
-def shells_of(
-    cell: Cell, chain: Chain
-) -> tuple[tuple[Shell, ...], tuple[Shell, ...], tuple[HalfSpace, ...], str]:
-    """What is drawn of a cell: the arm with what it carries, what stands around it, walls, and how
-    the arm is drawn; a geometry that cannot be had is replaced by capsules, and said so."""
+def shells_of(cell: Cell, chain: Chain) -> tuple[tuple[Shell, ...], tuple[Shell, ...], str]:
+    """What is drawn of a cell: the arm with what it carries, what stands around it, and how the arm
+    is drawn; a geometry that cannot be had is replaced by capsules, and said so."""
     radii, drawn_from = cell.workspace.link_radius, "capsules between its joints"
     arm: tuple[Shell, ...] = ()
     if cell.robot.urdf is not None and not radii:
         with suppress(ElastocalError):  # no collision geometry, or without its files
             arm = _shells(urdf_bodies(cell, chain))
-        if sum(len(s.faces) for s in arm) > MOST_TRIANGLES:
-            arm = ()
-        if arm:
-            drawn_from = "the convex hulls of the URDF's collision geometry"
-    if not arm:
+    if 0 < sum(len(s.faces) for s in arm) <= MOST_TRIANGLES:
+        drawn_from = "the convex hulls of the URDF's collision geometry"
+    else:
         steps = [*(joint.placement for joint in chain.joints), chain.flange_placement]
         whole = float(sum(np.linalg.norm(T[:3, 3]) for T in steps)) or 1.0
         radii = radii or tuple((whole * np.linspace(STOUT, SLIM, chain.n_joints)).tolist())
         capsules = skeleton(chain, radii, np.eye(4), f"{cell.source}: [workspace]")
-        arm = _shells([(body.solid, body.carrier) for body in capsules])
-    try:
-        bodies = list(cell_bodies(cell, chain))
-    except ElastocalError:
-        bodies = []  # a mesh that is not there stops no report
-    carried = [b for b in bodies if b.kind == "carried" and b.carrier >= 0]
-    arm = (*arm, *_shells([(b.solid, b.carrier) for b in carried]))
-    around = _shells([(b.solid, -1) for b in bodies if b.kind == "obstacle"])
-    return arm, around, cell.workspace.keep_out, drawn_from
+        arm = _shells((body.solid, body.carrier) for body in capsules)
+    bodies: Sequence[Body] = ()
+    with suppress(ElastocalError):  # a mesh that is not there stops no report
+        bodies = cell_bodies(cell, chain)
+    carried = ((b.solid, b.carrier) for b in bodies if b.kind == "carried" and b.carrier >= 0)
+    around = _shells((b.solid, b.carrier) for b in bodies if b.kind == "obstacle")
+    return (*arm, *_shells(carried)), around, drawn_from
 
 
-def _shells(solids: Sequence[tuple[Solid, int]]) -> tuple[Shell, ...]:
+def _shells(solids: Iterable[tuple[Solid, int]]) -> tuple[Shell, ...]:
     """Of solids and their carriers as collisions have them: 0 the first joint's frame."""
     found = []
     for solid, carrier in solids:
-        try:
+        with suppress(ElastocalError):  # an unreadable mesh: the others are still worth drawing
             found.append(Shell(*triangles_of(solid), max(carrier, -1) + 1, solid.name))
-        except ElastocalError:
-            continue  # an unreadable mesh: the others are still worth drawing
     return tuple(found)
 
 
@@ -149,7 +142,8 @@ class Space:
         what: str = "pose", groups: tuple[str, ...] = (),
     ) -> None:  # fmt: skip
         self.poses, self.first, self.what, self.groups = poses, first, what, groups
-        self.arm, self.around, self.walls, self.drawn_from = shells_of(cell, chain)
+        self.arm, self.around, self.drawn_from = shells_of(cell, chain)
+        self.walls = cell.workspace.keep_out
         self.tracker: Array | None = None
         low, high = self.extent = self._box()
         at = cell.tracker.position

@@ -180,8 +180,8 @@ def loads_text(forces: Array, one: str, several: str) -> str:
     """Forces in the words for `one` of them, or for their number and how large they are."""
     if len(forces) == 1:
         return one.format(newtons(forces[0]))
-    sizes = [math.hypot(*force) for force in forces]
-    return f"{several.format(len(sizes))}, {rounded(min(sizes), 4)} to {rounded(max(sizes), 4)} N"
+    ends = (rounded(pick(math.hypot(*force) for force in forces), 4) for pick in (min, max))
+    return f"{several.format(len(forces))}, {' to '.join(ends)} N"
 
 
 def _fixed(value: float, decimals: int) -> str:
@@ -219,7 +219,7 @@ def sentence(text: str) -> str:
 MOST_FAULTY = 100  # rows of the table of outliers
 
 
-def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> list[Block]:
+def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> Iterator[Block]:
     """Each with its line and names, its error in m, and that over the noise."""
     rows = [
         (str(o.line), printable(o.configuration), printable(o.marker), length(error),
@@ -227,9 +227,9 @@ def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> lis
         for o, error, ratio in found[:MOST_FAULTY]
     ]  # fmt: skip
     heads = ("line", "configuration", "marker", "error", "error / noise")
-    more = len(found) - len(rows)
-    left_out = [Sentence(f"and {more} more", soft=True)] if more else []
-    return [ShownTable(heads, rows, (1, 2), title=title), *left_out]
+    yield ShownTable(heads, rows, (1, 2), title=title)
+    if more := len(found) - len(rows):
+        yield Sentence(f"and {more} more", soft=True)
 
 
 # Steps (name, held-out rms in m, its 95 % interval), and name and size of what noise leaves.
@@ -371,23 +371,22 @@ def probability(p: float) -> str:
 def settings_text(settings: Mapping[str, float], lines: Sequence[float] = ()) -> str:
     """Searched constants with their units: "jump time 12.0 min, ripple order 101"; for want of
     times a moment is one between the `lines` of the table at which visits begin."""
-    ends = {key: key.replace("_low_", "_high_") for key in settings if "_low_" in key}
-    pairs = {low: high for low, high in ends.items() if high in settings}
     # What all names begin with says nothing.
     first = {key.partition("_")[0] + "_" for key in settings}
     begin = first.pop() if len(first) == 1 < len(settings) else ""
     texts = []
     for key, value in settings.items():
-        if LINE.fullmatch(key) or key.endswith(REFERENCE):
+        low, high = key.replace("_high_", "_low_"), key.replace("_low_", "_high_")
+        if LINE.fullmatch(key) or key.endswith(REFERENCE) or (low != key and low in settings):
             continue
         if lines and key.endswith("_time_s"):
             later = min((line for line in lines if line > value), default=value)
             texts.append(f"before line {later:.0f} of the table, by the order of its rows")
-        elif key in pairs:
-            high = setting_value(pairs[key], settings[pairs[key]])
-            texts.append(f"from {setting_value(key, value)} to {high}")
-        elif key not in pairs.values():
-            name = plain_name(_name_and_unit(key)[0].removeprefix(begin))
+        elif high != key and high in settings:
+            end = setting_value(high, settings[high])
+            texts.append(f"from {setting_value(key, value)} to {end}")
+        else:
+            name = plain_name(re.sub("_(s|rad)$", "", key).removeprefix(begin))
             texts.append(f"{name} {setting_value(key, value)}")
     return ", ".join([*texts, *_orders(settings)])
 
@@ -409,19 +408,13 @@ def _orders(settings: Mapping[str, float]) -> list[str]:
     return [f"order{'s' * (len(orders) > 1)} {together(told)}"] if told else []
 
 
-def _name_and_unit(key: str) -> tuple[str, str]:
-    name, _, unit = key.rpartition("_")
-    return (name, unit) if unit in ("s", "rad") and name else (key, "")
-
-
 def setting_value(key: str, value: float) -> str:
     """A searched constant in the unit of its key, "12.0 min" or "5.7°"; a size in mrad."""
-    unit = _name_and_unit(key)[1]
-    if unit == "rad":
+    if key.endswith("_rad"):
         if "size" in key:
             return f"{significant(value * 1e3)} mrad"
         return f"{significant(math.degrees(value))}°"
-    if unit != "s":
+    if not key.endswith("_s"):
         return significant(value, 4)
     if abs(value) < LONG_TIME:
         return f"{significant(value)} s"

@@ -85,8 +85,8 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     yield say.Fold("Noise", lambda: [say.Lines(noise)], printed=True)
     if d.noise.faulty:
         faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
-        found = say.outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
-        yield say.Fold("Outliers excluded", lambda: found)
+        each = [(f, f.error, f.sigmas) for f in faulty]
+        yield say.Fold("Outliers excluded", lambda: say.outlier_blocks("", each))
     if d.calibrated is not None:
         yield say.Fold("Residuals of the calibrated arm", lambda: _residuals(d),
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip

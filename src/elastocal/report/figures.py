@@ -53,32 +53,24 @@ _VARIABLES = {
     **{colour: f"var(--series{k + 1})" for k, colour in enumerate(SERIES)},
 }
 _STYLE: dict[str, Any] = {
-    "svg.fonttype": "none",
-    "svg.hashsalt": "elastocal",
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), FAINT),
+    **dict.fromkeys(("axes.facecolor", "figure.facecolor"), "none"),
+    **dict.fromkeys(("legend.fontsize", "xtick.labelsize", "ytick.labelsize"), 9.0),
     "font.size": 10.5,
-    "text.parse_math": False,  # names from files are not formulas
-    "text.color": INK,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": FAINT,
     "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.facecolor": "none",
     "axes.grid": True,
     "axes.axisbelow": True,
     "grid.color": GRID,
     "grid.linewidth": 0.6,
-    "xtick.color": FAINT,
-    "ytick.color": FAINT,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "figure.facecolor": "none",
     "legend.frameon": False,
-    "legend.fontsize": 9.0,
-    "xtick.labelsize": 9.0,
-    "ytick.labelsize": 9.0,
     "path.simplify": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "elastocal",
+    "text.parse_math": False,  # names from files are not formulas
 }
 LAYOUT: Any = "constrained"  # half of what drawing takes
 WIDTH = 5.6  # inches
@@ -195,12 +187,12 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
 
     axes.margins(x=0.18)  # with room for texts
     axes.xaxis.set_major_locator(MaxNLocator(5))  # "1.25 mm" is long
-    span = max(known, default=0) / max(min(known, default=0), 1e-300)
-    if lengths and min(known, default=0) > 0 and span > WIDE_RANGE:
+    least, span = min(known, default=0), max(known, default=0) / max(min(known, default=0), 1e-300)
+    if lengths and least > 0 and span > WIDE_RANGE:
         axes.set_xscale("log")
         subs = (1.0, 2.0, 5.0) if span < DENSE else (1.0, 3.0)[: 1 + (span < SPARSE)]
         axes.xaxis.set_major_locator(LogLocator(subs=subs, numticks=9))
-    elif min(known, default=0) >= 0 and axes.get_xlim()[1] > 0:
+    elif least >= 0 and axes.get_xlim()[1] > 0:
         low = axes.dataLim.x0
         axes.set_xlim(left=min(0.0, low) if math.isfinite(low) else 0.0)
     if lengths:
@@ -592,13 +584,28 @@ def uncertainty_map(result: Calibration) -> say.Figure | None:
     if good.sum() < FEWEST_ON_MAP:
         return None
     at = np.column_stack([np.hypot(nominal[:, 0], nominal[:, 1]), nominal[:, 2]])[good]
+    low, side = at.min(axis=0), float(np.ptp(at, axis=0).max()) / CELLS
+    keys, code = np.unique(np.floor((at - low) / side), axis=0, return_inverse=True)
+    count = np.bincount(code.ravel())
+    rms = np.sqrt(np.bincount(code.ravel(), 1e12 * variance[good]) / count)
+    told = count >= FEWEST
+    largest = float(rms[told].max(initial=0.0)) or 1.0
+    ends = low - 0.05 * side, low + side * (keys.max(axis=0) + 1.05)
 
     def draw(figure: Drawing) -> None:
+        from matplotlib.patches import Rectangle
+
         axes = figure.subplots()
-        axes.set_title(printable(f"marker {point}" if point in markers else "tool"))
-        _map(axes, at, 1e12 * variance[good], float(np.ptp(at, axis=0).max()) / CELLS)
-        axes.set_xlabel("distance from the base's z axis in m")
-        axes.set_ylabel("height over the base in m")
+        for (x, y), size in zip(
+            (low + side * keys[told]).tolist(), rms[told].tolist(), strict=True
+        ):
+            axes.add_patch(Rectangle((x, y), side, side, facecolor=SERIES[0], linewidth=0,
+                                     alpha=0.75 * size / largest))  # fmt: skip
+            text = say.significant(size, 2 if size < 100 else 3)
+            axes.text(x + side / 2, y + side / 2, text, ha="center", va="center", fontsize=9)
+        axes.set(xlim=[end[0] for end in ends], ylim=[end[1] for end in ends], aspect="equal",
+                 xlabel="distance from the base's z axis in m", ylabel="height over the base in m",
+                 title=printable(f"marker {point}" if point in markers else "tool"))  # fmt: skip
 
     caption = (
         "Expected error of the tool in µm (rms, measurement noise excluded), by where the nominal "
@@ -606,25 +613,3 @@ def uncertainty_map(result: Calibration) -> say.Figure | None:
         "covariance of the estimates, what these poses do not show, and possible model error."
     )
     return say.Figure("sureness", "Expected error over the work space", draw, 4.2, caption)
-
-
-def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
-    """Cells of `side` m that hold places `at` (n, 2): the rms of `squared` (n,) as shade, text."""
-    from matplotlib.patches import Rectangle
-
-    low = at.min(axis=0)
-    keys, code = np.unique(np.floor((at - low) / side), axis=0, return_inverse=True)
-    count = np.bincount(code.ravel())
-    rms = np.sqrt(np.bincount(code.ravel(), squared) / count)
-    told = count >= FEWEST
-    largest = float(rms[told].max(initial=0.0)) or 1.0
-    for key, size in zip(keys[told], rms[told], strict=True):
-        x, y = (low + side * key).tolist()
-        axes.add_patch(Rectangle((x, y), side, side, facecolor=SERIES[0], linewidth=0,
-                                 alpha=0.75 * size / largest))  # fmt: skip
-        text = say.significant(float(size), 2 if size < 100 else 3)
-        axes.text(x + side / 2, y + side / 2, text, ha="center", va="center", fontsize=9)
-    high = low + side * (keys.max(axis=0) + 1)
-    axes.set_xlim(float(low[0]) - 0.05 * side, float(high[0]) + 0.05 * side)
-    axes.set_ylim(float(low[1]) - 0.05 * side, float(high[1]) + 0.05 * side)
-    axes.set_aspect("equal")

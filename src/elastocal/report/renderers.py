@@ -94,10 +94,9 @@ def print_report(console: Console, result: object, details: bool = True, **told:
 
 
 def printed_text(result: object) -> str:
-    console = safe_console(file=StringIO(), width=PRINTED_WIDTH, color_system=None)
-    with console.capture() as capture:
-        print_report(console, result)
-    return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
+    text = StringIO()
+    print_report(safe_console(file=text, width=PRINTED_WIDTH, color_system=None), result)
+    return "\n".join(line.rstrip() for line in text.getvalue().rstrip().splitlines())
 
 
 def print_blocks(console: Console, blocks: Iterable[say.Block], details: bool = False) -> None:
@@ -135,15 +134,14 @@ def _shown(console: Console, block: say.Block) -> Iterable[RenderableType]:
     elif isinstance(block, say.ShownTable) and block.rows:
         shown, room = block, console.options.update(max_width=WIDEST)
         marked = "" in shown.heads  # by a last column, which is cut unless the others give way
-        while True:
-            table = table_of(shown, tight=marked)
-            least = Measurement.get(console, room, table).minimum
-            if shown.narrow is None or least <= console.width:
-                break
+
+        def width(table: Table) -> Measurement:
+            return Measurement.get(console, room, table)
+
+        while shown.narrow and width(table_of(shown, marked)).minimum > console.width:
             shown = shown.narrow
-        if Measurement.get(console, room, wide := table_of(shown)).maximum <= console.width:
-            table = wide
-        yield table
+        whole = table_of(shown)
+        yield whole if width(whole).maximum <= console.width else table_of(shown, marked)
         if block.note:
             yield Text(printable(block.note), style="dim")
 
@@ -200,7 +198,6 @@ def page_of(
     """`inputs` are the files read, or a map from their names to their SHA-256; `command` and `seed`
     tell how to repeat the run.  To a calibration `truth` (SI) adds true values, and `published`
     values (SI) and half widths that others found; `certificate` makes a certificate of it."""
-    named = digests(inputs)
     body = html_of(blocks_of(result, certificate, **told))
     kind = VIEWS["certificate" if certificate else type(result).__name__][2]
     if certificate and result.model.cell.certificate.missing:
@@ -222,7 +219,7 @@ def page_of(
         ("with", ", ".join([f"Python {platform.python_version()}", *versions])),
         ("model evaluated by", None if model is None else model.backend_report()),
         ("seed", getattr(result, "seed", seed)),
-        *((name, f"SHA-256 {digest}") for name, digest in named.items()),
+        *((name, f"SHA-256 {digest}") for name, digest in digests_of(inputs).items()),
     )  # fmt: skip
     rows = "".join(
         f'<tr><td class="name">{text_of(name, False)}</td>'
@@ -232,14 +229,9 @@ def page_of(
     last = f'<table class="repeat"><tbody>{rows}</tbody></table>'
     if not certificate:  # which is to be printed and kept, so that nothing is folded
         last = f"<details><summary>To repeat this</summary>{last}</details>"
-    return _framed(head, body + last, space, "filed" * certificate)
-
-
-def _framed(head: str, body: str, space: bool, kind: str) -> str:
-    """The whole page.  Where it has a 3-D view, plotly.js comes along.  It runs these two scripts,
-    named by their hashes, and no other: not even one that slipped into a name."""
     source, packed = plotly() if space else ("", "")
     script = say.resource("report.js")
+    # The page runs these two scripts, and no other: not even one that slipped into a name.
     digests = (hashlib.sha256(text.encode()).digest() for text in (script, source) if text)
     hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     carried = f'<script type="application/octet-stream" id="plotly">{packed}</script>'
@@ -254,9 +246,9 @@ style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
 <title>{head}</title>
 <style>{say.resource("style.css")}</style>
 </head>
-<body class="{kind}">
+<body class="{"filed" * certificate}">
 <h1>{head}</h1>
-{body}
+{body}{last}
 {carried if space else ""}
 <script>{script}</script>
 </body>
@@ -390,12 +382,13 @@ def sources(result: Any) -> list[Path]:
         "Calibration": lambda c: [c.model.cell.path, c.observations.table.source],
         "Diagnosis": lambda d: [d.model.cell.path, d.data],
         "Plan": lambda p: [p.model.cell.path],
+        "Measurements": lambda table: [table.source],
     }
-    named = of_kind.get(type(result).__name__, lambda r: [getattr(r, "source", None)])(result)
+    named = of_kind.get(type(result).__name__, lambda r: [])(result)
     return [Path(path) for path in named if path is not None and Path(path).is_file()]
 
 
-def digests(inputs: Inputs) -> dict[str, str]:
+def digests_of(inputs: Inputs) -> dict[str, str]:
     """File name → SHA-256; a map is taken as it is."""
     if inputs is None or isinstance(inputs, Mapping):
         return dict(inputs or {})
@@ -453,8 +446,7 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
         figure.savefig(picture, format="png", dpi=100, facecolor="white")
         return picture.getvalue()
 
-    # So that a notebook shows it although pyplot, whose hooks do so, is not loaded.
-    figure._repr_png_ = png
+    figure._repr_png_ = png  # for a notebook without pyplot, whose hooks do so
     return figure
 
 
