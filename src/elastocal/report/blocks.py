@@ -14,6 +14,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Literal
 
 from elastocal.measurements import in_file_units
@@ -313,22 +314,21 @@ STEPS = {"unknown": "what has no name", "rest": "the smaller causes"}
 
 def places(where: Iterable[str], runs: bool = False) -> str:
     numbers: dict[str, list[int]] = {}
-    told, others = [], []
+    others = []
     for one in where:
         if match := KINDS_OF_PLACE.fullmatch(one):
             numbers.setdefault(match[1], []).append(int(match[2]))
         else:
             others.append(place(one))
+    told = []
     for kind, found in numbers.items():
-        each: list[list[int]] = []  # numbers that follow each other
-        for n in sorted(found):
-            if runs and each and n == each[-1][-1] + 1:
-                each[-1].append(n)
-            else:
-                each.append([n])
-        texts = ([f"{r[0]} to {r[-1]}"] if len(r) > 2 else map(str, r) for r in each)
-        several = together([text for run in texts for text in run])
-        told.append(f"{kind}{'s' * (len(found) > 1)} {several}")
+        texts: list[str] = []
+        # Numbers that follow each other have the same distance from their index.
+        for _, run in groupby(enumerate(sorted(found)), lambda at: at[1] - at[0]):
+            first, *more = (str(n) for _, n in run)
+            short = runs and len(more) > 1
+            texts += [f"{first} to {more[-1]}"] if short else [first, *more]
+        told.append(f"{kind}{'s' * (len(found) > 1)} {together(texts)}")
     return together([*told, *others])
 
 

@@ -21,27 +21,23 @@ from elastocal.report import blocks as say
 
 def judgement(result: Calibration, reasons: bool = True) -> say.ShownVerdict:
     """With all its `reasons`, or where there are several without: they are lines of their own."""
-    trust = result.finding("trust")
-    assert trust is not None, "every identification is judged"
-    if trust.severity == "poor":
-        why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
-        return say.ShownVerdict("poor", f"Do not use this calibration: {_doubt(why)}.")
-    if trust.severity == "care":
-        named = list(map(_doubt, result.verdict.missing))
-        told = f": {'; and '.join(named)}" if reasons or len(named) == 1 else ""
-        return say.ShownVerdict(
-            "warn", f"Use this calibration with care{told}. {_accuracy(result)}"
-        )
-    compared = result.finding(*COMPARED[1:])
-    noise = "" if compared is None else " The residual is consistent with noise."
+    tone, doubts = result.verdict.tone, result.verdict.missing
+    if tone == "poor":
+        why = next(_doubt(f) for f in doubts if f.severity == "poor")
+        return say.ShownVerdict("poor", f"Do not use this calibration: {why}.")
+    if tone == "care":
+        told = f": {'; and '.join(map(_doubt, doubts))}" if reasons or len(doubts) == 1 else ""
+        text = f"Use this calibration with care{told}. {_accuracy(result)}"
+        return say.ShownVerdict("warn", text)
+    noise = " The residual is consistent with noise." * (result.finding(*COMPARED[1:]) is not None)
     return say.ShownVerdict("good", f"This calibration can be used. {_accuracy(result)}{noise}")
 
 
 def reasons_of(result: Calibration) -> list[str]:
     """Why it is to be used with care, where the verdict has not the room to say it."""
-    trust, named = result.finding("trust"), list(map(_doubt, result.verdict.missing))
-    several = trust is not None and trust.severity == "care" and len(named) > 1
-    return list(map(say.sentence, named)) if several else []
+    doubts = result.verdict.missing
+    several = result.verdict.tone == "care" and len(doubts) > 1
+    return [say.sentence(_doubt(f)) for f in doubts] if several else []
 
 
 def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
@@ -152,7 +148,6 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
 
 
 def _impossible(f: Finding) -> str:
-    """ "impossible values: compliance of joints 2 and 3 negative (-0.3, …); most likely …" """
     values = f.numbers["values"]
     shown = [" ".join((say.significant(number), unit)) for number, unit in
              map(say.display, values, f.numbers["units"])]  # fmt: skip
@@ -163,7 +158,6 @@ def _impossible(f: Finding) -> str:
 
 
 def _unheard_of(f: Finding) -> str:
-    """ "implausible values (link6.dx 32.1 mm, 32 typical sizes): …" """
     told = map(say.display, f.numbers["values"], f.numbers["units"])
     shown = [
         f"{printable(name)} at {say.significant(number)} {unit}, {say.significant(sizes, 2)} "
@@ -378,42 +372,39 @@ def noise_model_line(result: Calibration) -> str | None:
     sizes, reason = _sizes(noise), noise.reason
     if not sizes and not reason:
         return None
-    text = printable(noise.description)
-    text = text[:1].upper() + text[1:]
+    text = say.capital(printable(noise.description))
     text += f": {'; '.join(sizes)}" if sizes else ""
     candidates = candidate_table(noise).rows
-    if len(candidates) > 1:
+    if (n := len(candidates)) > 1:
         second, _, gap = candidates[1]
-        n = len(candidates)
         reason = f"smallest information criterion of {n} models, next {second} (+{gap})"
     return f"{text}. Chosen: {printable(reason)}." if reason else f"{text}."
 
 
 def _sizes(noise: Noise) -> list[str]:
-    def number(s: NoiseSize) -> float:
-        return (s.factor or 0.0) if s.sigma is None else s.sigma
-
-    def size(s: NoiseSize) -> str:
+    def told(s: NoiseSize, name: str) -> str:
         if s.sigma is None:
-            return say.significant(number(s))
-        return f"{say.significant(s.sigma * 1e6)} µrad" if s.turns else say.length(s.sigma)
+            return f"{printable(name)} {say.significant(s.factor or 0.0)}"
+        size = f"{say.significant(s.sigma * 1e6)} µrad" if s.turns else say.length(s.sigma)
+        return f"{printable(name)} {size}"
 
     sizes = noise.sizes or ()
-    shared, alone = ([s for s in sizes if bool(s.part) == whether] for whether in (True, False))
-    own, named = sorted(alone, key=number), [(s.name, s) for s in alone]
-    if len(own) > FEW:
-        named = [(f"median of {len(own)}", own[len(own) // 2])]
-        named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
-    return [f"{printable(n)} {size(s)}" for n, s in [*named, *((s.name, s) for s in shared)]]
+    alone, shared = ([s for s in sizes if bool(s.part) == whether] for whether in (False, True))
+    named = [(s, s.name) for s in alone]
+    if (n := len(alone)) > FEW:
+        own = sorted(alone, key=lambda s: (s.factor or 0.0) if s.sigma is None else s.sigma)
+        named = [(own[n // 2], f"median of {n}")]
+        named += [(own[0], f"smallest ({own[0].name})"), (own[-1], f"largest ({own[-1].name})")]
+    return [told(s, name) for s, name in [*named, *((s, s.name) for s in shared)]]
 
 
 def candidate_table(noise: Noise) -> say.ShownTable:
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
-    words = (printable(Kind.parsed(t.kind).words) for t in tried)
     rows = [
-        (text, str(t.variances), f"{t.criterion - tried[0].criterion:.1f}")
-        for text, t in zip(words, tried, strict=True)
-    ]
+        (printable(Kind.parsed(t.kind).words), str(t.variances),
+         f"{t.criterion - tried[0].criterion:.1f}")
+        for t in tried
+    ]  # fmt: skip
     heads = ("noise model", "variances", "criterion over best")
     note = (
         "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
