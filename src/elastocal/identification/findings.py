@@ -11,15 +11,8 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
-from elastocal.identification import noise_summary
+from elastocal.identification import mistakes, noise_summary
 from elastocal.identification.faulty_readings import exchanged
-from elastocal.identification.mistakes import (
-    STATED_BY_FILE,
-    far_values,
-    impossible,
-    impossible_values,
-    load_unit,
-)
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
@@ -93,21 +86,24 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
     fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
     noise = [*compared, *_repeats(result, fits)]
     explained = _explained(result, noise)
-    visits, far = list(_visits(result, fits)), list(far_values(result, explained, _lacking(result)))
+    visits, far = (
+        list(_visits(result, fits)),
+        list(mistakes.far_values(result, explained, _lacking(result))),
+    )
     held, nominal, shares = result.heldout_rms, result.nominal_rms, result.prior_share
     if not result.converged:
         yield _poor("not_converged", reason=result.reason)
     if nominal <= held < math.inf and not only_placed(result):
         yield _poor("no_better_than_nominal", heldout_rms_um=held, nominal_rms_um=nominal)
     yield from (f for f in of_solution if f.kind == "exchanged_markers")
-    yield from impossible_values(result)
+    yield from mistakes.impossible_values(result)
     yield from far
     if copies := result.copies:
         fitted = len(result.observations.lead)
         yield _note("copied_readings", copies=len(copies), fitted=fitted, lines=copies)
     # Where all lengths are others than the cell's, so are the compliances to expect.
     if not any(f.kind == "scale" for f in far):
-        yield from load_unit(result)
+        yield from mistakes.load_unit(result)
     if weak := tuple(name for name, standing in standings(result).items() if standing == WEAK):
         yield _note("hardly_shown", parameters=weak)
     yield from (f for f in visits if f.kind == "scatter_not_counted")
@@ -220,7 +216,7 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
 
 def _named(result: Calibration) -> list[str]:
     effects = dict.fromkeys(p.effect for p in result.model.parameters)
-    usual = [e for e in effects if e in STATED_BY_FILE or effect_of(e).registered]
+    usual = [e for e in effects if e in mistakes.STATED_BY_FILE or effect_of(e).registered]
     return [e.replace("_", " ") for e in effects if e not in usual]
 
 
@@ -542,7 +538,7 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
 
 def _bounds(result: Calibration) -> Iterator[Finding]:
     at = {name: k for k, name in enumerate(result.determined)}
-    told = {p.name for p, _ in impossible(result)}
+    told = {p.name for p, _ in mistakes.impossible(result)}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
         if e.limits is None or not p.beyond(e.limits) or p.name in told:
             continue

@@ -15,23 +15,13 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import VIEWS, WORDS, DataFrame, Result, checked_arguments
 from elastocal.cell_tables import Unsteadiness
-from elastocal.identification import scrutiny
+from elastocal.identification import prediction, scrutiny
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import Outlier
-from elastocal.identification.prediction import (
-    Excess,
-    Position,
-    PredictedError,
-    excess_of,
-    measured_loads,
-    measured_visits,
-    over_the_workspace,
-    position_at,
-)
 from elastocal.measurements import Measurements
 from elastocal.messages import (
     EXACT,
@@ -238,56 +228,50 @@ def more_poses() -> str:
     )
 
 
-# What to do about findings of a kind; of others it depends on more.
-REMEDIES: dict[str, str | Callable[[], str]] = {
-    "autocorrelated": "Visit poses and loads in random order and return to a reference pose every "
-    "ten poses: residuals of visits that follow each other are alike, as where something drifts, "
-    "or where the model lacks what neighbouring poses have in common.",
-    "beyond_bound": AT_BOUND,
-    "copied_readings": "Find out how lines came to be in the table twice; readings that were "
-    "rounded until they agree should be given with all their digits.",
-    "few_configurations": more_poses,
-    "few_degrees_of_freedom": "Measure more poses.",
-    "fit_flatters": more_poses,
-    "hardly_shown": "Measure poses and loads that strain what the readings hardly show (elastocal "
-    "design plans them), or give it a prior.",
-    "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
-    "parameters.",
-    "many_faulty_readings": "Check where they lie before excluding any.",
-    "new_poses_no_gain": more_poses,
-    "new_poses_not_shown": lambda: (
-        f"{more_poses()} For a part of the joint ranges alone, state test poses in the cell."
-    ),
-    "not_converged": "Give start hints in [model.nominal], fit fewer effects, or measure more "
-    "poses.",
-    "residual_below_stated_noise": "State the tracker's true noise: with noise stated too large, a "
-    "missing effect does not show.",
-    "residuals_heavy_tailed": lambda: (
-        f"Compare with a robust fit ({option('method')} huber or l1): where parameters differ by "
-        "more than their intervals, far readings decide them; look for what makes single readings "
-        "err (line of sight, vibration, a tracker that has not settled)."
-    ),
-    "test_data_far": "Measure poses like those of the test: the fit extrapolates to them.",
-    "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
-    "(joints, load), fit some like them; where they do not, the arm or the tracker has changed in "
-    "between.",
-    "untested": lambda: (
-        "Validate on independent poses: measure some that are not fitted, and give "
-        f"them with {option('test')}."
-    ),
-}
+def remedies() -> dict[str, str]:
+    """What to do about findings of a kind, options named as messages do now; of others it depends
+    on more."""
+    return {
+        "autocorrelated": "Visit poses and loads in random order and return to a reference pose "
+        "every ten poses: residuals of visits that follow each other are alike, as where something "
+        "drifts, or where the model lacks what neighbouring poses have in common.",
+        "beyond_bound": AT_BOUND,
+        "copied_readings": "Find out how lines came to be in the table twice; readings that were "
+        "rounded until they agree should be given with all their digits.",
+        **dict.fromkeys(("few_configurations", "fit_flatters", "new_poses_no_gain"), more_poses()),
+        "few_degrees_of_freedom": "Measure more poses.",
+        "hardly_shown": "Measure poses and loads that strain what the readings hardly show "
+        "(elastocal design plans them), or give it a prior.",
+        "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
+        "parameters.",
+        "many_faulty_readings": "Check where they lie before excluding any.",
+        "new_poses_not_shown": f"{more_poses()} For a part of the joint ranges alone, state test "
+        "poses in the cell.",
+        "not_converged": "Give start hints in [model.nominal], fit fewer effects, or measure more "
+        "poses.",
+        "residual_below_stated_noise": "State the tracker's true noise: with noise stated too "
+        "large, a missing effect does not show.",
+        "residuals_heavy_tailed": f"Compare with a robust fit ({option('method')} huber or l1): "
+        "where parameters differ by more than their intervals, far readings decide them; look for "
+        "what makes single readings err (line of sight, vibration, a tracker that has not "
+        "settled).",
+        "test_data_far": "Measure poses like those of the test: the fit extrapolates to them.",
+        "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
+        "(joints, load), fit some like them; where they do not, the arm or the tracker has changed "
+        "in between.",
+        "untested": "Validate on independent poses: measure some that are not fitted, and give "
+        f"them with {option('test')}.",
+    }
 
 
 def made(severity: Severity, kind: str, remedy: str | None = None, /, **numbers: Any) -> Finding:
     """A finding with the remedy of its kind unless one is given; numbers whose names end in _um or
     _urad are given in m and rad."""
-    if remedy is None:
-        known = REMEDIES.get(kind, "")
-        remedy = known if isinstance(known, str) else known()
     for name, value in numbers.items():
         if name.endswith(("_um", "_urad")):
             several = isinstance(value, tuple)
             numbers[name] = tuple(v * 1e6 for v in value) if several else float(value) * 1e6
+    remedy = remedies().get(kind, "") if remedy is None else remedy
     return Finding(kind, severity, numbers, remedy)
 
 
@@ -397,7 +381,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     prior_share: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     left: OpenParameters | None = None
-    predicted: PredictedError | None = None
+    predicted: prediction.PredictedError | None = None
     copies: tuple[int, ...] = ()
     shown: ShownPoses | None = None
     scatter: Scatter | None = None
@@ -580,10 +564,11 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     def arm(self) -> CalibratedArm:
         """The calibrated arm, in memory: to be commanded (`compensate`), posed and saved."""
         lacking = 0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean()))
+        read = self.observations
         return CalibratedArm(
-            self.model, self.x, self.determined, self.covariance, self.observations.table.source,
+            self.model, self.x, self.determined, self.covariance, read.table.source,
             tuple(map(_estimate_json, self.estimates)), self.left, lacking,
-            measured_loads(self.observations), self.shown, measured_visits(self.observations),
+            prediction.measured_loads(read), self.shown, prediction.measured_visits(read),
             mostly_prior(self.prior_share), self.scatter,
         )  # fmt: skip
 
@@ -597,7 +582,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         tool, at = self.model.cell.tool, self.verdict.at
         if not tool.load_point.any() or at is None:
             return None
-        poses = over_the_workspace(self.model.cell, self.model, self.observations.table)
+        poses = prediction.over_the_workspace(self.model.cell, self.model, self.observations.table)
         try:
             found = self.position(poses.q[:FEW_POSES], poses.force[:FEW_POSES])
         except ElastocalError:
@@ -606,15 +591,15 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         return rms if rms > max(at, EXACT) else None
 
     @cached_property
-    def excess(self) -> Excess | None:
+    def excess(self) -> prediction.Excess | None:
         """By how much configurations scatter beyond their noise; None where nothing tells it."""
         rng = np.random.default_rng(0)
-        return excess_of(self.observations, self.residual, self.dof, self.noise, rng)
+        return prediction.excess_of(self.observations, self.residual, self.dof, self.noise, rng)
 
     @checked_arguments
     def position(
         self, q: ArrayLike, load: ArrayLike | None = None, point: str | None = None
-    ) -> Position:
+    ) -> prediction.Position:
         """Where the tool is at any pose, with covariance and region.
 
         Args:
@@ -640,7 +625,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         model = self.model
         given_force(load, len(model.table(q)))
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
-        return position_at(tool, model.table(q, load), self.noise, self.spread)
+        return prediction.position_at(tool, model.table(q, load), self.noise, self.spread)
 
     @checked_arguments
     def predict(
@@ -683,25 +668,24 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
         observed, table = self.observations, self.observations.table
         held, rows = self.held_out.reshape(-1, observed.size), list[dict[str, Any]]()
-        for k, i in enumerate(observed.lead):
+        for i, own, left_out in zip(observed.lead, self.residuals, held, strict=True):
             row: dict[str, Any] = {
                 "line": int(table.row[i]),
                 "configuration": table.configuration_labels[table.configuration[i]],
                 "repeat": int(table.repeat[i]),
                 "marker": table.marker_names[table.marker[i]],
             }
-            for j, name in enumerate(COMPONENTS[observed.kind]):
+            for name, *each in zip(COMPONENTS[observed.kind], own, left_out, strict=True):
                 unit = "urad" if name.startswith("r") else "um"
-                row[f"residual_{name}_{unit}"] = float(self.residuals[k, j]) * 1e6
-                row[f"heldout_{name}_{unit}"] = float(held[k, j]) * 1e6
+                for of, value in zip(("residual", "heldout"), each, strict=True):
+                    row[f"{of}_{name}_{unit}"] = float(value) * 1e6
             rows.append(row)
         return rows
 
     def to_json(self) -> dict[str, Any]:
         """The result as a JSON-ready dictionary (DESIGN: identify → JSON)."""
-        chain, observed, test, off = (
-            self.model.chain, self.observations, self.test, self.unsteadiness
-        )  # fmt: skip
+        chain, observed, off = self.model.chain, self.observations, self.unsteadiness
+        tested = {} if self.test is None else self.test.to_json()
         said = import_module(WORDS).judgement(self).sentence if self.findings else None
         return plain({
             "schema": SCHEMA,
@@ -712,14 +696,12 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
             "data": observed.table.source,
             "parameters": [_estimate_json(e) for e in self.estimates],
             "covariance_of": self.determined,
-            "loads_N": measured_loads(observed),
+            "loads_N": prediction.measured_loads(observed),
             "n_rows": len(self.residual),
             "n_readings": len(observed.lead),
             "heldout_kept_rms_um": microns(self.heldout_rms),
             **{f"{name}_um": microns(getattr(self, name)) for name in LENGTHS},
-            "test_rms_um": None if test is None else microns(test.rms),
-            "test_mean_um": None if test is None else microns(test.mean),
-            "test_max_um": None if test is None else microns(test.maximum),
+            **{f"test_{name}": tested.get(name) for name in ("rms_um", "mean_um", "max_um")},
             "verdict": self.verdict.to_json() | {"sentence": said},
             "predicted_new_poses_um": self.predicted,
             "load_point_um": microns(self.load_point_error),

@@ -21,15 +21,7 @@ from elastocal.messages import ElastocalError, load_text, printable, require
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.planning.collision import (
-    Body,
-    Kinematics,
-    cell_bodies,
-    hull,
-    outward,
-    skeleton,
-    urdf_bodies,
-)
+from elastocal.planning import collision
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks as say
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
@@ -65,18 +57,18 @@ def shells_of(cell: Cell, chain: Chain) -> tuple[tuple[Shell, ...], tuple[Shell,
     arm: tuple[Shell, ...] = ()
     if cell.robot.urdf is not None and not radii:
         with suppress(ElastocalError):  # no collision geometry, or without its files
-            arm = _shells(urdf_bodies(cell, chain))
+            arm = _shells(collision.urdf_bodies(cell, chain))
     if 0 < sum(len(s.faces) for s in arm) <= MOST_TRIANGLES:
         drawn_from = "the convex hulls of the URDF's collision geometry"
     else:
         steps = [*(joint.placement for joint in chain.joints), chain.flange_placement]
         whole = float(sum(np.linalg.norm(T[:3, 3]) for T in steps)) or 1.0
         radii = radii or tuple((whole * np.linspace(STOUT, SLIM, chain.n_joints)).tolist())
-        capsules = skeleton(chain, radii, np.eye(4), f"{cell.source}: [workspace]")
+        capsules = collision.skeleton(chain, radii, np.eye(4), f"{cell.source}: [workspace]")
         arm = _shells((body.solid, body.carrier) for body in capsules)
-    bodies: Sequence[Body] = ()
+    bodies: Sequence[collision.Body] = ()
     with suppress(ElastocalError):  # a mesh that is not there stops no report
-        bodies = cell_bodies(cell, chain)
+        bodies = collision.cell_bodies(cell, chain)
     carried = ((b.solid, b.carrier) for b in bodies if b.kind == "carried" and b.carrier >= 0)
     around = _shells((b.solid, b.carrier) for b in bodies if b.kind == "obstacle")
     return (*arm, *_shells(carried)), around, drawn_from
@@ -94,9 +86,9 @@ def _shells(solids: Iterable[tuple[Solid, int]]) -> tuple[Shell, ...]:
 def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
     """Points (k, 3) in m in the carrier's frame and triangles (f, 3), turned outwards; round shapes
     become inscribed polyhedra."""
-    centres, radius = hull(solid)
+    centres, radius = collision.hull(solid)
     if not radius:
-        return outward(centres)
+        return collision.outward(centres)
     angle = np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(MERIDIANS)])
     # Heights on the unit sphere: poles, and rings of which one is the equator.
@@ -104,7 +96,7 @@ def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
     heights = np.zeros(1) if solid.shape == "cylinder" else heights
     around = np.vstack([ring * np.sqrt(1 - h * h) + [0.0, 0.0, h] for h in heights])
     around = radius * around @ solid.placement[:3, :3].T
-    return outward((centres[:, None] + around).reshape(-1, 3))
+    return collision.outward((centres[:, None] + around).reshape(-1, 3))
 
 
 ARROW = 0.12  # length of a long arrow over the reach of what is drawn
@@ -230,7 +222,7 @@ def frames_at(
     """Frames (N, n + 1, 4, 4) of base and joints, and flanges (N, 4, 4), at joints q (N, n): of the
     nominal chain, moved as a whole to end at `flange` (N, 4, 4) where that is known; on a page, the
     millimetres between the two cannot be seen."""
-    kinematics = Kinematics(cell, chain)
+    kinematics = collision.Kinematics(cell, chain)
     poses = kinematics.poses(q, np.zeros(3))
     base = np.broadcast_to(kinematics.T_data_base, (len(q), 1, 4, 4))
     frames = np.concatenate([base, poses.frames[:, : chain.n_joints]], axis=1)

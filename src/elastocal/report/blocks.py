@@ -140,7 +140,7 @@ MOST_DECIMALS = 9
 
 def with_uncertainty(value: float, half: float) -> tuple[str, str]:
     """ "0.287", "0.003": the half width gets two digits where it begins with 1 or 2, else one;
-    hundreds and more are rounded off as well."""
+    hundreds and more are rounded off as well, and nothing is -0."""
     if not (math.isfinite(value) and math.isfinite(half)) or half <= 0:
         return plain(value), plain(half)
     exponent = math.floor(math.log10(half))
@@ -149,7 +149,8 @@ def with_uncertainty(value: float, half: float) -> tuple[str, str]:
     if decimals > MOST_DECIMALS:
         size = math.floor(math.log10(abs(value))) if value else exponent
         return f"{value:.{min(max(size + decimals, 0), 15)}e}", f"{half:.{digits - 1}e}"
-    return _fixed(value, decimals), _fixed(half, decimals)
+    value, half = (round(v, decimals) + 0.0 for v in (value, half))
+    return f"{value:.{max(decimals, 0)}f}", f"{half:.{max(decimals, 0)}f}"
 
 
 def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
@@ -183,11 +184,6 @@ def loads_text(forces: Array, one: str, several: str) -> str:
         return one.format(newtons(forces[0]))
     ends = (rounded(pick(math.hypot(*force) for force in forces), 4) for pick in (min, max))
     return f"{several.format(len(forces))}, {' to '.join(ends)} N"
-
-
-def _fixed(value: float, decimals: int) -> str:
-    """Rounded, also to tens, and never -0."""
-    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}"
 
 
 def short_name(name: str, most: int = 12) -> str:

@@ -7,19 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from elastocal.diagnosis import diagnosis
 from elastocal.diagnosis.component_answer import SLIGHT
-from elastocal.diagnosis.diagnosis import (
-    NORMAL_95,
-    STRUCTURE,
-    ComponentShare,
-    Curve,
-    Diagnosis,
-    EffectAt,
-    FoundEffect,
-    Interval,
-    Location,
-    NoiseFloor,
-)
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.measurements import by_rows
 from elastocal.messages import printable, some
 from elastocal.report import blocks as say
@@ -113,7 +103,7 @@ def _residuals(d: Diagnosis) -> Iterator[say.Block]:
 
 
 def noise_floor_lines(
-    noise: NoiseFloor, kinds: Iterable[str], along: str = " per axis"
+    noise: diagnosis.NoiseFloor, kinds: Iterable[str], along: str = " per axis"
 ) -> Iterator[str]:
     text = "; nothing was stated"
     if noise.stated:
@@ -153,12 +143,6 @@ def noise_floor_lines(
     if n := len(noise.faulty):
         worst = say.length(max(f.error for f in noise.faulty))
         yield f"{say.counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
-
-
-NONE_NAMED = (
-    "No effect is named: something may be missing, but nothing both stands out from the noise and "
-    "lowers the error at poses left out of the fit"
-)
 
 
 def diagnosis_headline(d: Diagnosis) -> str:
@@ -201,12 +185,15 @@ def diagnosis_headline(d: Diagnosis) -> str:
         text = "An effect outside the catalogue causes the remaining error"
         return f"{text}, {where}." if where else f"{text}; the data do not show where."
     none = f"probability of none: {say.probability(d.probability_nothing)}"
+    if not d.doubtful:
+        return f"No further effect exceeds the noise; {none}."
     return (
-        f"{NONE_NAMED} ({none})." if d.doubtful else f"No further effect exceeds the noise; {none}."
+        "No effect is named: something may be missing, but nothing both stands out from the noise "
+        f"and lowers the error at poses left out of the fit ({none})."
     )
 
 
-def location_text(location: Location) -> str:
+def location_text(location: diagnosis.Location) -> str:
     at, stage = say.place(location.where), say.STAGES[location.stage]
     where = f"at {'the ' * (at in say.SINGLE)}{at}"
     if stage not in at and not stage.startswith(at.split()[0]):  # not "at link 2, in the links"
@@ -230,7 +217,7 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
         none = f"no single driver that was tested shows it{shape}"
         yield "Depends on", f"{some(told, MOST_NAMED) or none}."
     chance = " after correction for all candidates."
-    if not d.effects and d.p_value > STRUCTURE:
+    if not d.effects and d.p_value > diagnosis.STRUCTURE:
         chance = " for the strongest candidate, corrected for all candidates."
     if d.groups:
         if spans := [f"{curve_span(curve)} ({say.place(curve.entry)})" for curve in d.curves]:
@@ -332,7 +319,7 @@ def alike(d: Diagnosis) -> list[str]:
     with its probability."""
     taken = {(f.effect, f.where): f.probability for f in d.effects} if d.groups else {}
 
-    def told(e: EffectAt) -> str:
+    def told(e: diagnosis.EffectAt) -> str:
         p = taken.get((e.effect, e.where))
         return say.effect_at(e) + ("" if p is None else f" (probability {say.probability(p)})")
 
@@ -374,7 +361,9 @@ def added_parameter_table(d: Diagnosis) -> say.ShownTable:
     for f in d.effects:
         for p in f.parameters:
             told = p.value if math.isfinite(p.std) else math.nan
-            rows.append((printable(p.name), *say.estimate(told, NORMAL_95 * p.std, p.unit)))
+            rows.append(
+                (printable(p.name), *say.estimate(told, diagnosis.NORMAL_95 * p.std, p.unit))
+            )
         if f.settings:
             rows.append((f"{say.effect_at(f)}: {settings_of(d, f.settings)}", "", "", ""))
     title = "Parameters of the effects found"
@@ -425,8 +414,7 @@ def untested_table(d: Diagnosis) -> say.ShownTable:
 
 def location_table(d: Diagnosis) -> say.ShownTable:
     """The stages of the chain from commanded joints to tracker, and the likeliest places."""
-    location = d.location
-    if location is None:
+    if (location := d.location) is None:
         return say.ShownTable((), [])
     found = location.shares or location.stages
     rows = [
@@ -442,11 +430,11 @@ def location_table(d: Diagnosis) -> say.ShownTable:
     return say.ShownTable(("where", "probability"), rows, groups=groups)
 
 
-def _error_of(c: ComponentShare) -> str:
+def _error_of(c: diagnosis.ComponentShare) -> str:
     return FAMILIES.get(c.family, say.plain_name(c.family))
 
 
-def _unnamed(d: Diagnosis) -> list[tuple[str, ComponentShare]]:
+def _unnamed(d: Diagnosis) -> list[tuple[str, diagnosis.ComponentShare]]:
     return [
         (f"{NAMELESS}, {_error_of(c)} at {say.place(c.where)}", c)
         for c in d.components
@@ -464,7 +452,7 @@ def share_text(fraction: float, fine: bool | None = None) -> str:
     return f"{round(100 * fraction, digits) + 0.0:.{digits}f} %"
 
 
-def span_text(ends: Interval, middle: float) -> str:
+def span_text(ends: diagnosis.Interval, middle: float) -> str:
     """ "50 to 59 %", "1.2 to 2.0 %", as fine as what is in the `middle`."""
     low, high = ends
     if not (math.isfinite(low) and math.isfinite(high)):
@@ -507,7 +495,7 @@ def place_table(d: Diagnosis) -> say.ShownTable:
     found += [(name, [c]) for name, c in _unnamed(d)]
     rows: list[tuple[str, ...]] = []
     groups: dict[int, str] = {}
-    told: list[ComponentShare] = []
+    told: list[diagnosis.ComponentShare] = []
     for name, of_it in found:
         parts = [c for c in of_it if c not in told]
         if parts:
@@ -528,7 +516,7 @@ def place_table(d: Diagnosis) -> say.ShownTable:
     return table.when_narrow(2)  # what it is as effects stands in the table of parameters too
 
 
-def curve_span(curve: Curve) -> str:
+def curve_span(curve: diagnosis.Curve) -> str:
     moved = max(curve.y) - min(curve.y)
     if curve.y_unit == "m":
         return say.length(moved)
@@ -562,7 +550,7 @@ FOLLOWED = {
 }  # fmt: skip
 
 
-def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
+def _followed(f: diagnosis.FoundEffect) -> Iterable[tuple[str, ...]]:
     """A row for everything that a field follows; the last columns in the first row only."""
     fall, kind = f.gap_reduction, f.where.partition(":")[0].rstrip("0123456789")
     told: Sequence[str] = (share_text(fall), span_text(f.gap_reduction_ci95, fall))
@@ -587,7 +575,7 @@ def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
         told = ("", "")
 
 
-def added_text(found: Sequence[FoundEffect]) -> str:
+def added_text(found: Sequence[diagnosis.FoundEffect]) -> str:
     """What a written cell has more, by effect: "gear_ripple:joint1", or many of them in short."""
     if len(found) <= 2 * MOST_IN_HEADLINE:
         return ", ".join(f"{f.effect}:{f.where}" for f in found)

@@ -333,25 +333,24 @@ def _table(t: say.ShownTable, deep: int, summary: str) -> str:
         f'<th scope="col" class="{kind}">{text_of(head)}</th>'
         for kind, head in zip(kinds, t.heads, strict=True)
     ]
+    # What stands before a cell where a screen is too narrow for columns.
+    before = ["" if head == "unit" else text_of(head) for head in t.heads]
     rows = []
     for k, row in enumerate(t.rows):
         if k in t.groups:
             rows.append(f'<tr class="group"><th scope="colgroup" colspan="{len(heads)}">'
                         f"{text_of(t.groups[k])}</th></tr>")  # fmt: skip
-        cells = [_cell(*each) for each in zip(kinds, t.heads, row, strict=True)]
-        rows.append(f"<tr>{''.join(cells)}</tr>")
+        cells = "".join(
+            f'<td class="{kind}{f" {text}" * (text in STYLES)}" data-head="{head}">'
+            f"{text_of(text)}</td>"
+            for kind, head, text in zip(kinds, before, row, strict=True)
+        )
+        rows.append(f"<tr>{cells}</tr>")
     body = "\n".join(rows)
     return (
         f'{title}<table class="data" data-name="{"-".join(slug)}"><thead>'
         f"<tr>{''.join(heads)}</tr></thead>\n<tbody>{body}</tbody></table>{below}"
     )
-
-
-def _cell(kind: str, head: str, text: str) -> str:
-    """`data-head` stands before the cell where a screen is too narrow for columns."""
-    tone = f" {text}" if text in ("inside", "outside", "changed") else ""
-    before = "" if head == "unit" else text_of(head)
-    return f'<td class="{kind}{tone}" data-head="{before}">{text_of(text)}</td>'
 
 
 def _picture(block: say.Figure) -> str:
