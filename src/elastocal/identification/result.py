@@ -32,16 +32,7 @@ from elastocal.messages import (
     plain,
     rounded,
 )
-from elastocal.model.calibrated import (
-    CalibratedArm,
-    CalibratedTool,
-    OpenParameters,
-    Scatter,
-    ShownPoses,
-    mostly_prior,
-    nominal_flange_rows,
-    tool_point,
-)
+from elastocal.model import calibrated
 from elastocal.model.effects.base import given_force
 from elastocal.model.observations import COMPONENTS, observe
 from elastocal.units import Array, microns
@@ -380,11 +371,11 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
-    left: OpenParameters | None = None
+    left: calibrated.OpenParameters | None = None
     predicted: prediction.PredictedError | None = None
     copies: tuple[int, ...] = ()
-    shown: ShownPoses | None = None
-    scatter: Scatter | None = None
+    shown: calibrated.ShownPoses | None = None
+    scatter: calibrated.Scatter | None = None
 
     @property
     def covariance(self) -> Array:
@@ -561,15 +552,15 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         return scrutiny.autocorrelation(self.residual, self.observations)
 
     @cached_property
-    def arm(self) -> CalibratedArm:
+    def arm(self) -> calibrated.CalibratedArm:
         """The calibrated arm, in memory: to be commanded (`compensate`), posed and saved."""
         lacking = 0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean()))
         read = self.observations
-        return CalibratedArm(
+        return calibrated.CalibratedArm(
             self.model, self.x, self.determined, self.covariance, read.table.source,
             tuple(map(_estimate_json, self.estimates)), self.left, lacking,
             prediction.measured_loads(read), self.shown, prediction.measured_visits(read),
-            mostly_prior(self.prior_share), self.scatter,
+            calibrated.mostly_prior(self.prior_share), self.scatter,
         )  # fmt: skip
 
     @cached_property
@@ -624,7 +615,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """
         model = self.model
         given_force(load, len(model.table(q)))
-        tool = CalibratedTool(self.arm, tool_point(model.cell, point))
+        tool = calibrated.CalibratedTool(self.arm, calibrated.tool_point(model.cell, point))
         return prediction.position_at(tool, model.table(q, load), self.noise, self.spread)
 
     @checked_arguments
@@ -691,7 +682,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
             "schema": SCHEMA,
             "robot": chain.name,
             "joints": [joint.name for joint in chain.joints],
-            "nominal_flange": nominal_flange_rows(chain),
+            "nominal_flange": calibrated.nominal_flange_rows(chain),
             "cell": self.model.cell.name,
             "data": observed.table.source,
             "parameters": [_estimate_json(e) for e in self.estimates],

@@ -331,20 +331,19 @@ def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
     base, panels = d.calibrated, list[Panel]()
     if base is None or base.planned:
         return
-    model, observed = base.model, base.observed
+    model, observed, table = base.model, base.observed, base.observed.table
     wanted = [f for f in d.effects if f"{f.where}.offset" in model.names and f.parameters]
-    B = model.regressor(observed.table, base.x, observations=observed).B if wanted else NO_COLUMNS
+    B = model.regressor(table, base.x, observations=observed).B if wanted else NO_COLUMNS
     for f in wanted[:MOST_SHAPES]:
         more = model.cell.model.with_effect(f.effect, f.where, f.settings)
-        new = {p.name: p.value for p in f.parameters}
-        values = dict(zip(model.names, base.x, strict=True)) | new
+        values = dict(zip(model.names, base.x, strict=True))
+        values |= {p.name: p.value for p in f.parameters}
         try:
             full = Model.assembled(model.chain, replace(model.cell, model=more))
             x = np.array([values[name] for name in full.names])
-            moved = full.predict(observed.table, x, observed)
+            moved = full.predict(table, x, observed) - model.predict(table, base.x, observed)
         except (ElastocalError, KeyError):
             continue  # what it needs besides is not in the table
-        moved = moved - model.predict(observed.table, base.x, observed)
         left = base.residual - moved + B @ least_norm(B, moved)
         b = B[:, model.names.index(f"{f.where}.offset")].reshape(-1, observed.size)
         size = (b**2).sum(axis=1)
@@ -353,11 +352,11 @@ def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
             1e6 * (b * v.reshape(b.shape)).sum(axis=1)[good] / size[good]
             for v in (moved + left, moved)
         )
-        joint, table, lead = index(f.where), observed.table, observed.lead[good]
+        joint, lead = index(f.where), observed.lead[good]
         # From where the joint came, 0 where that is not known.
-        came = np.zeros(len(lead))
-        if table.approach is not None:
-            came = np.sign(table.approach[lead, joint])
+        came = (
+            np.zeros(len(lead)) if table.approach is None else np.sign(table.approach[lead, joint])
+        )
         each = model.chain.kinds[joint], table.q[lead, joint], came, seen, explained
         panels.append(partial(_by_side, say.effect_at(f), joint + 1, *each))
     caption = (

@@ -13,7 +13,7 @@ import hashlib
 import math
 import platform
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from datetime import date
 from functools import cache
 from html import escape
@@ -34,16 +34,7 @@ from elastocal import __version__
 from elastocal.above import checked_arguments
 from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
-from elastocal.messages import (
-    InputError,
-    cell_meaning,
-    check_known,
-    listed,
-    option,
-    printable,
-    quoted,
-    require,
-)
+from elastocal.messages import cell_meaning, check_known, listed, option, printable, quoted, require
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
 from elastocal.screen import safe_console, shown
@@ -412,33 +403,35 @@ def html(result: object) -> str:
 def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) -> Any:
     """matplotlib's, in the place of `ax` where that is given, or of the arm plotly's where
     `interactive`."""
+    from elastocal.report.figures import figure_of
+
     folds = [block for block in blocks_of(result) if isinstance(block, say.Fold)]
     every = [name for fold in folds for name in fold.figures]
     arms = [name for name in every if name in ("space", "poses")]
     chosen = DEFAULTS.get(type(result).__name__, every[0]) if kind is None else kind
     if interactive and kind is None and arms:
         chosen = arms[0]
-    opened = say.unfolded(folds, lambda fold: chosen in fold.figures)
-    found = [b for b in opened if isinstance(b, say.Figure) and b.name == chosen]
-    if not found:
-        opened = say.unfolded(folds, lambda fold: bool(fold.figures))
-        there = [block.name for block in opened if isinstance(block, say.Figure)]
-        check_known(chosen, there, f"no figure {quoted(chosen)}")
+
+    def figures(names: Collection[str]) -> dict[str, say.Figure]:
+        opened = say.unfolded(folds, lambda fold: not set(names).isdisjoint(fold.figures))
+        return {block.name: block for block in opened if isinstance(block, say.Figure)}
+
+    found = figures([chosen]).get(chosen)
+    if found is None:
+        check_known(chosen, figures(every), f"no figure {quoted(chosen)}")
+    assert found is not None
     if interactive:
-        if found[0].space is None:
-            told = f"; interactive=True turns the arm: {listed(arms)}" if arms else ""
-            raise InputError(f"the figure {quoted(chosen)} stands still{told}")
+        told = f"; interactive=True turns the arm: {listed(arms)}" * bool(arms)
+        require(found.space, f"the figure {quoted(chosen)} stands still{told}")
         from elastocal.report.arm_view import turned
 
-        return turned(found[0].space)
-    from elastocal.report.figures import figure_of
-
+        return turned(found.space)
     if ax is not None:
         spot: Any = getattr(ax, "get_subplotspec", lambda: None)()
         require(spot is not None, "`ax` takes axes that plt.subplots or Figure.subplots made")
         ax.remove()
-        return figure_of(found[0], spot.get_gridspec().figure.add_subfigure(spot))
-    figure: Any = figure_of(found[0])
+        return figure_of(found, spot.get_gridspec().figure.add_subfigure(spot))
+    figure: Any = figure_of(found)
 
     def png() -> bytes:
         picture = BytesIO()
@@ -488,19 +481,17 @@ def _candidates(d: Diagnosis) -> list[dict[str, Any]]:
     causes are judged together comes first, without a score."""
     found = {(f.effect, f.where): f for f in d.effects}
     tried = {(c.effect, c.where): c for c in d.candidates}
-    rows = []
-    for key in dict.fromkeys([*(key for key in found if key not in tried), *tried]):
-        f, c = found.get(key), tried.get(key)
-        rows.append(
-            {
-                "effect": key[0], "where": key[1], "stage": effect_of(key[0]).stage,
-                "probability": getattr(c or f, "probability", np.nan),
-                "score": getattr(c, "score", np.nan),
-                "detectable": getattr(c, "detectable", np.nan), "found": f is not None,
-                "gap_reduction": getattr(f, "gap_reduction", np.nan),
-            }
-        )  # fmt: skip
-    return rows
+    return [
+        {
+            "effect": key[0], "where": key[1], "stage": effect_of(key[0]).stage,
+            "probability": getattr(c or f, "probability", np.nan),
+            "score": getattr(c, "score", np.nan),
+            "detectable": getattr(c, "detectable", np.nan), "found": f is not None,
+            "gap_reduction": getattr(f, "gap_reduction", np.nan),
+        }
+        for key in dict.fromkeys([*(key for key in found if key not in tried), *tried])
+        for f, c in ((found.get(key), tried.get(key)),)
+    ]  # fmt: skip
 
 
 def _commands(c: Compensation) -> pd.DataFrame:
