@@ -1,10 +1,8 @@
 """What a result says as a list of blocks, made once and shown by terminal, page and notebook;
 numbers, names and effects as text.
 
-Each kind of result has a function that gives its blocks.  Texts are plain: a renderer escapes
-them, typesets minus signs and decides on the layout.  A terminal shows what stands open, and with
-details the folds that are `printed`; it leaves out figures.  Numbers have the units people think in
-and the digits that are known.
+Texts are plain: a renderer escapes them, typesets minus signs and decides on the layout.  Numbers
+have the units people think in and the digits that are known.
 """
 
 from __future__ import annotations

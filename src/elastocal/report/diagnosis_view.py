@@ -105,13 +105,11 @@ def _residuals(d: Diagnosis) -> Iterator[say.Block]:
 def noise_floor_lines(
     noise: diagnosis.NoiseFloor, kinds: Iterable[str], along: str = " per axis"
 ) -> Iterator[str]:
-    text = "; nothing was stated"
+    text = f"A reading scatters by {say.length(noise.reading_sigma)} rms{along}"
     if noise.stated:
-        text = (
-            f", {say.significant(noise.stated_factor, 2)} times what is stated, and "
-            f"{say.significant(noise.ratio_to_stated)} times with the scatter of the joints"
-        )
-    yield f"A reading scatters by {say.length(noise.reading_sigma)} rms{along}{text}."
+        text += f", {say.significant(noise.stated_factor, 2)} times what is stated, and "
+        text += f"{say.significant(noise.ratio_to_stated)} times with the scatter of the joints"
+    yield f"{text}{'' if noise.stated else '; nothing was stated'}."
     joints = [
         f"joint {i + 1} {say.significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
         for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
@@ -130,16 +128,12 @@ def noise_floor_lines(
     else:
         yield f"Repeats scatter by {say.length(noise.pure_error)} rms{along}."
     if (near := noise.near_repeats) is not None:
-        times = ""
+        text = f"Readings at nearly the same pose ({say.counted(near.pairs, 'pair')}) scatter by "
+        text += f"{say.length(near.scatter)} rms{along}"
         if near.soon is not None and near.later is not None:
-            times = (
-                f" (measured soon after each other {say.length(near.soon)}, in other parts of the "
-                f"session {say.length(near.later)})"
-            )
-        yield (
-            f"Readings at nearly the same pose ({say.counted(near.pairs, 'pair')}) scatter by "
-            f"{say.length(near.scatter)} rms{along}{times}."
-        )
+            text += f" (measured soon after each other {say.length(near.soon)}, in other parts of "
+            text += f"the session {say.length(near.later)})"
+        yield f"{text}."
     if n := len(noise.faulty):
         worst = say.length(max(f.error for f in noise.faulty))
         yield f"{say.counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
@@ -250,10 +244,8 @@ def _error_line(d: Diagnosis) -> str:
     calibrated, floor = say.length(d.gap.calibrated), say.length(d.gap.noise_floor)
     if not d.effects:
         return f"Held-out error: {calibrated} rms (noise alone: {floor})."
-    text = (
-        f"Held-out error: {calibrated} rms, with the effects found {say.length(d.gap.explained)} "
-        f"rms (noise alone: {floor})."
-    )
+    text = f"Held-out error: {calibrated} rms, with the effects found "
+    text += f"{say.length(d.gap.explained)} rms (noise alone: {floor})."
     if d.groups:  # the table of causes says what each takes away
         nameless = [say.length(s.heldout_rms) for s in d.budget if s.step.startswith("unknown:")]
         return text + f" With unnamed smooth corrections: {nameless[-1]}." if nameless else text
@@ -425,8 +417,8 @@ def location_table(d: Diagnosis) -> say.ShownTable:
     if location.shares:
         return say.ShownTable(("where", "share of the error"), rows, groups={0: "stages"})
     groups = {0: "stages", len(rows): "places"}
-    order = sorted(location.places.items(), key=lambda item: -item[1])
-    rows += [(say.place(where), say.probability(p)) for where, p in order[:MOST_PLACES]]
+    order = sorted(location.places, key=location.places.__getitem__, reverse=True)[:MOST_PLACES]
+    rows += [(say.place(where), say.probability(location.places[where])) for where in order]
     return say.ShownTable(("where", "probability"), rows, groups=groups)
 
 
@@ -493,12 +485,10 @@ def place_table(d: Diagnosis) -> say.ShownTable:
         for g in d.groups
     ]  # fmt: skip
     found += [(name, [c]) for name, c in _unnamed(d)]
-    rows: list[tuple[str, ...]] = []
-    groups: dict[int, str] = {}
+    rows, groups = list[tuple[str, ...]](), dict[int, str]()
     told: list[diagnosis.ComponentShare] = []
     for name, of_it in found:
-        parts = [c for c in of_it if c not in told]
-        if parts:
+        if parts := [c for c in of_it if c not in told]:
             groups[len(rows)] = name
         for c in parts:
             low, high = map(say.length, c.rms_ci95)
@@ -563,15 +553,10 @@ def _followed(f: diagnosis.FoundEffect) -> Iterable[tuple[str, ...]]:
         of = name.rstrip("_").partition("_")[2]
         timed = of == "time"
         angle = f"the angle of {say.place(of)}" if of else "its own angle"
-        yield (
-            say.place(f.where),
-            FOLLOWED.get(key, "the time" if timed else angle),
-            f"{say.significant(value * 1e3, 2)} {unit}",
-            say.setting_value("over_s" if timed else "over_rad", over)
-            if math.isfinite(over)
-            else "–",
-            *told,
-        )
+        shown = say.setting_value("over_s" if timed else "over_rad", over)
+        size = f"{say.significant(value * 1e3, 2)} {unit}"
+        what = FOLLOWED.get(key, "the time" if timed else angle)
+        yield say.place(f.where), what, size, shown if math.isfinite(over) else "–", *told
         told = ("", "")
 
 

@@ -1,8 +1,4 @@
-"""Figures by matplotlib: SVG that stands in a page and follows its colours, or Figures to plot.
-
-How a figure is drawn; values with their intervals; a diagnosis' curves and effects; a plan's curve;
-residuals as a table and over configurations, joints and time; errors over the work space.
-"""
+"""Figures by matplotlib: SVG that stands in a page and follows its colours, or Figures to plot."""
 
 from __future__ import annotations
 

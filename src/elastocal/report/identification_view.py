@@ -385,7 +385,7 @@ def coverage(result: Calibration, truth: Truth | None) -> str | None:
     if not truth:
         return None
     found = [inside(truth.get(e.name), e.ci95) for e in result.ordinary]
-    hit, n = found.count("inside"), len(found) - found.count("")
+    hit, n = found.count("inside"), sum(map(bool, found))
     return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
 
 
@@ -477,9 +477,8 @@ def is_lopsided(e: Estimate | Combination) -> bool:
 def parameter_table(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
 ) -> say.ShownTable:
-    own = [e for e in result.ordinary if e.identifiable]
+    own, more = [e for e in result.ordinary if e.identifiable], dict[str, list[str]]()
     known = {p.name: p for p in result.model.parameters}
-    more: dict[str, list[str]] = {}
     if truth:
         true = [truth.get(e.name) for e in own]
         more["truth"] = [texts(e, value)[3] for e, value in zip(own, true, strict=True)]

@@ -282,10 +282,10 @@ def constraints_line(result: Calibration) -> str | None:
 
     text = some(map(told, active), MOST_NAMED, "; ", "; and {} more")
     bound = any(a.kind != "equality" for a in active)
-    want = "; the readings alone would go beyond the bounds" if bound else ""
     held = "Intervals take these for exact"
     if result.noise.interval_kind.lower() == "constrained profile":
         held = "Intervals keep the constraints: they stop at bounds and take equalities for exact"
+    want = "; the readings alone would go beyond the bounds" * bound
     return f"Active: {text}. {held}{want}."
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from string import Template
@@ -569,19 +570,7 @@ def _poses(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Bloc
         )
 
 
-UNITS = {
-    "m": "\\metre",
-    "rad": "\\radian",
-    "rad/(N*m)": "\\radian\\newton\\tothe{-1}\\metre\\tothe{-1}",
-    "m/N": "\\metre\\newton\\tothe{-1}",
-    "N/m": "\\newton\\metre\\tothe{-1}",
-    "N": "\\newton",
-    "kg": "\\kilogram",
-    "m/s": "\\metre\\second\\tothe{-1}",
-    "rad/s": "\\radian\\second\\tothe{-1}",
-    "1/K": "\\kelvin\\tothe{-1}",
-}
-ONE = "\\one"  # of a unit that is not listed
+SI = {"m": "metre", "rad": "radian", "N": "newton", "kg": "kilogram", "s": "second", "K": "kelvin"}
 NAMED = '<dcc:name><dcc:content lang="en">%s</dcc:content></dcc:name>'
 QUANTITY = f"{NAMED}<dcc:data><dcc:quantity>{NAMED}%s</dcc:quantity></dcc:data>"
 REAL = "<si:real><si:value>%.9g</si:value><si:unit>%s</si:unit>%s</si:real>"
@@ -611,7 +600,7 @@ def dcc_text(result: Calibration) -> str:
           for e in result.ordinary if e.value is not None and e.std is not None),
     ]  # fmt: skip
     results = [
-        f"<dcc:result>{_quantity(name, value, UNITS.get(unit, ONE), expanded)}</dcc:result>"
+        f"<dcc:result>{_quantity(name, value, _unit(unit), expanded)}</dcc:result>"
         for name, value, unit, expanded in found
     ]
     told = {
@@ -628,6 +617,16 @@ def dcc_text(result: Calibration) -> str:
     root = ElementTree.fromstring(text)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _unit(unit: str) -> str:
+    """As D-SI has it: "rad/(N*m)^3" → \\radian\\newton\\tothe{-3}\\metre\\tothe{-3}."""
+    over, _, under = unit.partition("/")
+    power = f"\\tothe{{-{under.partition('^')[2] or 1}}}"
+    found = [(SI.get(name), "") for name in over.split("*") if name != "1"]
+    found += [(SI.get(name), power) for name in re.findall("[A-Za-z]+", under)]
+    known = found and all(name for name, _ in found)
+    return "".join(f"\\{name}{power}" for name, power in found) if known else "\\one"
 
 
 def _xml(text: str) -> str:
