@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from elastocal.diagnosis import diagnosis
+from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.component_answer import SLIGHT
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.measurements import by_rows
@@ -77,8 +78,8 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
         faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
         each = [(f, f.error, f.sigmas) for f in faulty]
         yield say.Fold("Outliers excluded", lambda: say.outlier_blocks("", each))
-    if d.calibrated is not None:
-        yield say.Fold("Residuals of the calibrated arm", lambda: _residuals(d),
+    if (base := d.calibrated) is not None:
+        yield say.Fold("Residuals of the calibrated arm", lambda: _residuals(base),
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
 
 
@@ -89,17 +90,11 @@ def _figures(d: Diagnosis) -> Iterator[say.Figure]:
         yield unknown_curves(d)
 
 
-def _residuals(d: Diagnosis) -> Iterator[say.Block]:
-    from elastocal.report.arm_view import residual_arm
-
-    base = d.calibrated
-    assert base is not None
-    residuals = Residuals(base.model, base.observed, base.residual)
+def _residuals(base: Baseline) -> Iterator[say.Block]:
+    residuals = Residuals(base.model, base.observed, base.x, base.residual)
+    arm, *others = residuals.others()
     yield say.Sentence("What the model leaves before the effects found are added.")
-    yield residual_arm(base.model, base.observed, base.x, base.residual)
-    yield from residuals.figures()
-    yield from residuals.over_time()
-    yield residuals.table()
+    yield from (arm, *residuals.figures(), *others)
 
 
 def noise_floor_lines(

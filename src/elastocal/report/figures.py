@@ -197,11 +197,9 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
 
 
 def waterfall(name: str, steps: say.Steps, floor: say.Floor, of: str) -> say.Figure:
-    caption = (
-        f"Held-out {of} error with its 95 % interval, as the model gains one part after the other. "
-    )
-    caption += "The noise level is unknown." if floor is None else "Dashed: the noise level."
-    title = "Error budget, step by step"
+    noise = "The noise level is unknown." if floor is None else "Dashed: the noise level."
+    how = "with its 95 % interval, as the model gains one part after the other"
+    caption, title = f"Held-out {of} error {how}. {noise}", "Error budget, step by step"
     return rows_of_dots(name, title, steps, "held-out rms error", caption, floor)
 
 
@@ -413,11 +411,11 @@ MOST_CONFIGURATIONS = 200
 
 
 class Residuals:
-    """Residuals (observations, components) of a model in µm (µrad for rotations) as figures and a
-    table; `shown` are the observations to draw, all or a random choice."""
+    """Residuals (observations, components) of a model at x in µm (µrad for rotations) as figures
+    and a table; `shown` are the observations to draw, all or a random choice."""
 
-    def __init__(self, model: Model, observed: Observations, residual: Array) -> None:
-        self.kinds, self.observed = model.chain.kinds, observed
+    def __init__(self, model: Model, observed: Observations, x: Array, residual: Array) -> None:
+        self.fit, self.observed = (model, observed, x, residual), observed
         self.components = COMPONENTS[observed.kind]
         self.units = ["µrad" if name.startswith("r") else "µm" for name in self.components]
         self.value = residual.reshape(-1, observed.size) * 1e6
@@ -427,9 +425,16 @@ class Residuals:
         if n > MOST_DRAWN:
             self.shown = np.sort(np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False))
 
-    def figures(self) -> Iterator[say.Figure]:
-        yield self.by_configuration()
-        yield self.over_joints()
+    def figures(self) -> tuple[say.Figure, say.Figure]:
+        return self.by_configuration(), self.over_joints()
+
+    def others(self) -> Iterator[say.Block]:
+        from elastocal.report.arm_view import residual_arm
+
+        yield residual_arm(*self.fit)
+        if self.observed.table.time is not None:
+            yield self.over_time(self.observed.table.time[self.observed.lead] / 60)
+        yield self.table()
 
     def _thinned(self, drawn: int) -> str:
         total = len(self.value)
@@ -484,16 +489,16 @@ class Residuals:
                           linestyle=lines[k % len(lines)], label=self.components[k])  # fmt: skip
 
     def over_joints(self) -> say.Figure:
-        n, shown = self.lengths.shape[1], self.shown
+        n, shown, kinds = self.lengths.shape[1], self.shown, self.fit[0].chain.kinds
         if len(shown) * n > MOST_JOINT_DOTS:
             shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
 
         def panel(axes: Axes, j: int) -> None:
-            q, unit = _in_unit(self.kinds[j], self.observed.table.q[self.observed.lead, j])
+            q, unit = _in_unit(kinds[j], self.observed.table.q[self.observed.lead, j])
             self._over(axes, q, shown, 1.3, "-")
             axes.set(xlabel=f"joint {j + 1} in {unit}", ylabel="" if j % 2 else "residual in µm")
 
-        panels = [partial(panel, j=j) for j in range(len(self.kinds))]
+        panels = [partial(panel, j=j) for j in range(len(kinds))]
         caption = (
             "Over joint positions; lines are means of equally many readings with twice their "
             "standard error. A wave or slope is an effect that the model lacks."
@@ -504,12 +509,8 @@ class Residuals:
             sharey=True,
         )  # fmt: skip
 
-    def over_time(self) -> Iterator[say.Figure]:
-        if self.observed.table.time is None:
-            return
-        at, unit = self.observed.table.time[self.observed.lead] / 60, "min"
-        if float(np.ptp(at)) > 180:
-            at, unit = at / 60, "h"
+    def over_time(self, minutes: Array) -> say.Figure:
+        at, unit = (minutes / 60, "h") if float(np.ptp(minutes)) > 180 else (minutes, "min")
 
         def panel(axes: Axes) -> None:
             self._over(axes, at, self.shown, 1.5, ("-", "--", ":"))
@@ -519,7 +520,7 @@ class Residuals:
             "Over time; lines are means with twice their standard error. A slope is a drift, a "
             "step something that moved."
         )
-        yield panelled(
+        return panelled(
             "over_time", "Residuals over time", [panel], caption + self._thinned(len(self.shown)),
             2.9, columns=3,
         )  # fmt: skip

@@ -75,7 +75,8 @@ def calibration_blocks(
         ("Truth", coverage(result, truth)),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    residuals = cache(lambda: Residuals(result.model, result.observations, result.residual))
+    fit = result.model, result.observations, result.x, result.residual
+    residuals = cache(lambda: Residuals(*fit))
     yield say.Fold("", lambda: residuals().figures(), figures=("residuals", "against_joints"))
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
     yield say.Fold("Method, noise and intervals", lambda: _method(result), printed=True)
@@ -94,7 +95,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: _on_the_arm(result, residuals()),
+        lambda: residuals().others(),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -130,14 +131,6 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
         yield found
-
-
-def _on_the_arm(result: Calibration, residuals: Residuals) -> Iterator[say.Block]:
-    from elastocal.report.arm_view import residual_arm
-
-    yield residual_arm(result.model, result.observations, result.x, result.residual)
-    yield from residuals.over_time()
-    yield residuals.table()
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:

@@ -48,11 +48,10 @@ OF_LOADS = {
 def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     rms, noise = (say.length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
     most = say.length(float(c.distance.max()))
-    figures = [
+    yield say.Fold("", lambda: [say.KeyFigures(f"moved by {rms} (noise {noise})", [
         ("the tool has moved, rms", rms), ("at most", most), ("noise alone", noise),
         ("all parameters together", say.size_of(c.p)),
-    ]  # fmt: skip
-    yield say.Fold("", lambda: [say.KeyFigures(f"moved by {rms} (noise {noise})", figures)])
+    ])])  # fmt: skip
     steps = [
         "Use the new calibration (elastocal compensate, elastocal export).",
         ("Look for the cause at the joints and links named. " if c.changed else
