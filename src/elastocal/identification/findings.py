@@ -17,12 +17,11 @@ from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
 from elastocal.identification.prediction import unread_markers
-from elastocal.identification.result import Calibration, Estimate, Finding, made, more_poses
+from elastocal.identification.result import Calibration, Finding, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.measurements import Measurements, numbered, told_of_rounding
 from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of
 from elastocal.model.calibrated import MOSTLY, mostly_prior
-from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.units import display
 
@@ -73,12 +72,8 @@ def judged(
         of_solution = [*_conditioning(result, solution), *_exchanged(result, whole)]
     found = tuple(_found(result, of_solution))
     poor, care = (tuple(f.kind for f in found if f.severity == s) for s in ("poor", "care"))
-    use = (
-        "Use it (elastocal compensate, elastocal export) where poses and loads are like those "
-        "measured."
-    )
-    say, use = (_poor if poor else _care, "") if poor or care else (_good, use)
-    return replace(result, findings=(say("trust", use, because=poor or care), *found))
+    say, doing = (_poor if poor else _care, "") if poor or care else (_good, None)
+    return replace(result, findings=(say("trust", doing, because=poor or care), *found))
 
 
 def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]:
@@ -280,8 +275,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     """Joints that settle anew at each visit, and a drift: what a test of false-alarm rate SCATTERS
     finds, whether the noise model has it or not."""
     noise, stated = result.noise, result.model.cell.noise
-    ask = "Ask what the model lacks (elastocal diagnose)"
-    ask = "Repeat some poses" if _named(result) else ask
+    ask = "Repeat some poses" if _named(result) else "Ask what the model lacks (elastocal diagnose)"
     sizes = [s for s in noise.sizes or () if s.sigma]
     scatter = stated.of_joints(result.model.chain.n_joints)
     joints = [s for s in sizes if s.joints]
@@ -456,29 +450,25 @@ def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, WEAK (hardly shown),
     BEYOND (its physical bound), UNREAD (of a marker without readings), INVISIBLE or FIXED."""
     unread = _unread(result)
-    first = {next(iter(c.terms)) for c in result.combinations}
-
-    def standing(p: Parameter, e: Estimate) -> str:
+    first, found = {next(iter(c.terms)) for c in result.combinations}, {}
+    for p, e in zip(result.model.parameters, result.estimates, strict=True):
+        found[p.name] = UNREAD if p.where in unread else INVISIBLE
         if e.limits is not None:
-            return BEYOND if p.beyond(e.limits) else WEAK
-        if e.identifiable:
-            return ALONE
-        if e.name in first:
-            return COMBINED
-        if e.combined_with:
-            return ABSORBED
-        if e.note.startswith("fixed"):
-            return FIXED
-        return UNREAD if p.where in unread else INVISIBLE
-
-    pairs = zip(result.model.parameters, result.estimates, strict=True)
-    return {p.name: standing(p, e) for p, e in pairs}
+            found[p.name] = BEYOND if p.beyond(e.limits) else WEAK
+        elif e.identifiable:
+            found[p.name] = ALONE
+        elif e.name in first:
+            found[p.name] = COMBINED
+        elif e.combined_with:
+            found[p.name] = ABSORBED
+        elif e.note.startswith("fixed"):
+            found[p.name] = FIXED
+    return found
 
 
 def shape_of(summary: ResidualSummary) -> Finding:
-    skew, kurtosis, p = (
-        summary.whole.skewness, summary.whole.excess_kurtosis, summary.whole.normality_p
-    )  # fmt: skip
+    whole = summary.whole
+    skew, kurtosis, p = whole.skewness, whole.excess_kurtosis, whole.normality_p
     say, kind = _note, "residuals_too_few"
     if p is not None and p >= NOT_NORMAL:
         say, kind = _good, "residuals_normal"
@@ -691,8 +681,8 @@ def next_steps(result: Calibration) -> list[Finding]:
     """Findings whose remedy is still to be told, each remedy once, the worthiest first."""
     steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in TOLD_ELSEWHERE}
     # One that begins with another says that too.
-    whole = {r for r in steps if r and not any(s != r and s.startswith(r) for s in steps)}
-    order = [f for f in result.findings if f.remedy in whole and steps[f.remedy] is f]
+    order = [f for f in result.findings if f.remedy and steps.get(f.remedy) is f
+             and not any(s != f.remedy and s.startswith(f.remedy) for s in steps)]  # fmt: skip
     found, ranks = result.predicted, ("poor", "care", "note", "good", "trust", "undetermined")
     slight = found is not None and found.open < SLIGHT * found.rms
     last = {"trust", "undetermined"} if slight else {"trust"}

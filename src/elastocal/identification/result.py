@@ -250,6 +250,8 @@ def remedies() -> dict[str, str]:
         "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
         "(joints, load), fit some like them; where they do not, the arm or the tracker has changed "
         "in between.",
+        "trust": "Use it (elastocal compensate, elastocal export) where poses and loads are like "
+        "those measured.",
         "untested": "Validate on independent poses: measure some that are not fitted, and give "
         f"them with {option('test')}.",
     }

@@ -56,6 +56,7 @@ _STYLE: dict[str, Any] = {
     "font.size": 10.5,
     "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
+    "axes.prop_cycle": f"cycler(color={list(SERIES)})",
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -74,10 +75,8 @@ WIDTH = 5.6  # inches
 
 def style() -> AbstractContextManager[None]:
     import matplotlib.style
-    from cycler import cycler
 
-    cycle = cycler(color=SERIES)
-    return matplotlib.style.context(["default", {**_STYLE, "axes.prop_cycle": cycle}])
+    return matplotlib.style.context(["default", _STYLE])
 
 
 def figure_of(block: say.Figure, place: SubFigure | None = None) -> Drawing | SubFigure:

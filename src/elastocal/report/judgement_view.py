@@ -62,7 +62,8 @@ def _doubt(f: Finding) -> str:
         return words(f)
     return words.format(**{
         name: _length(f, name) if name.endswith("_um")
-        else say.significant(value) if isinstance(value, float) else value
+        else say.significant(value) if isinstance(value, float)
+        else listed(value) if isinstance(value, tuple) else value
         for name, value in f.numbers.items()
     })  # fmt: skip
 
@@ -96,9 +97,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     ),
     "autocorrelated": "residuals of successive visits are correlated, as under a drift or where "
     "successive poses are alike",
-    "exchanged_markers": lambda f: (
-        f"the names of markers {listed(f.numbers['markers'])} are exchanged"
-    ),
+    "exchanged_markers": "the names of markers {markers} are exchanged",
     "load_unit": lambda f: (
         f"the compliances are {say.significant(f.number('ratio'), 2)} times those expected from "
         f"{f.numbers['by']}: the loads may be in another unit"
