@@ -20,7 +20,7 @@ from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.base import COLUMNS
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, pose_at
 
 LEAST_STEP = 1e-9  # m between levels
 MOST_POINTS = 200_000
@@ -109,12 +109,11 @@ def correction_table(
     kept, points = calibrated.lasting(arm)[0], grid.points()
     sided, tool = _sided(kept), CalibratedTool(kept, point)
     if force is not None and frame == "tracker":
-        (T, *_), _, _ = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
+        ((T, *_), _) = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
         force = T[:3, :3].T @ force
     progress(f"{len(points)} grid points")
     result = single.compensate(arm, _targets(arm, grid, points, force), point, near, seed, progress)
     correction, status = _corrections(tool, result)
-    oriented = result.goals.rotation is not None
     before = between = np.zeros((0, 2))
     if any(len(axis) > 1 for axis in grid.axes):
         progress("between the grid points")
@@ -138,7 +137,9 @@ def correction_table(
         finer = f"give more levels by {option('grid')}, or narrow [limits]"
         told = (*told, f"{worse}; do not use it: {finer}")
     sure = result.uncertainty
-    return CorrectionTable(grid, points, correction, status, oriented, before, between, sure, told)
+    return CorrectionTable(
+        grid, points, correction, status, result.oriented, before, between, sure, told
+    )
 
 
 def _sided(arm: CalibratedArm) -> tuple[str, ...]:
@@ -214,55 +215,54 @@ def _targets(
 def _corrections(
     tool: CalibratedTool, result: single.Compensation
 ) -> tuple[Array, tuple[str, ...]]:
-    aimed = result.goals.in_base(result.T_data_base)
-    nominal = single.Goals(result.place, result.turned).through(
-        nominal_flanges(tool.chain, result.q)
-    )
-    exact = _between(aimed, nominal)
-    achieved = _achieved(tool, result, result.nominal)
-    first_order = _between(achieved, aimed)
+    aimed = np.linalg.inv(result.T_data_base) @ result.goals
+    nominal = nominal_flanges(tool.chain, result.q) @ result.T_flange_tool
+    exact = _between(aimed, nominal, result.oriented)
+    first_order = _between(_achieved(tool, result, result.nominal), aimed, result.oriented)
     step = np.abs(result.q - result.nominal).max(axis=1)
     close = result.reached & (step <= single.LARGE_CORRECTION)
     # A nominal command that misses its own target is none that a correction could start from.
-    usable = np.isfinite(achieved.position).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
+    usable = np.isfinite(first_order).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
     correction = np.where(close[:, None], exact, first_order)
     correction[~(close | usable)] = np.nan
     status = np.where(close, EXACT, np.where(usable, FIRST_ORDER, result.status))
     return correction, tuple(status.tolist())
 
 
-def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> single.Goals:
+def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> Array:
+    """Where the tool is (n, 4, 4) in the base frame when commanded to q."""
     rows = tool.rows(result.targets.moved(q, result.force))
-    return single.Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
+    return np.linalg.inv(result.T_data_base) @ pose_at(*tool.poses(rows, q))
 
 
-def _between(one: single.Goals, other: single.Goals) -> Array:
-    """(n, 6) from one pose to another: p' − p, and the rotation vector of R' Rᵀ, zero where a
-    rotation is any."""
-    turned = np.zeros_like(one.position)
-    if one.rotation is not None and other.rotation is not None:
-        change = other.rotation @ one.rotation.transpose(0, 2, 1)
+def _between(one: Array, other: Array, oriented: bool) -> Array:
+    """(n, 6) from one pose (n, 4, 4) to another: p' − p, and the rotation vector of R' Rᵀ, zero
+    unless `oriented`."""
+    turned = np.zeros((len(one), 3))
+    if oriented:
+        change = other[:, :3, :3] @ one[:, :3, :3].transpose(0, 2, 1)
         good = np.isfinite(change).all(axis=(1, 2))
         turned[good] = Rotation.from_matrix(change[good]).as_rotvec()
-    return np.hstack([other.position - one.position, turned])
+    return np.hstack([other[:, :3, 3] - one[:, :3, 3], turned])
 
 
 def _with_table(
     tool: CalibratedTool, check: single.Compensation, correction: Array
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
-    aimed = check.goals.in_base(check.T_data_base)
+    aimed = np.linalg.inv(check.T_data_base) @ check.goals
     usable = np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
-    known = np.flatnonzero(usable)
-    moved, flange = aimed.position + correction[:, :3], None
-    if aimed.rotation is not None:
-        turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix()
-        flange = (turned @ aimed.rotation @ check.turned.transpose(0, 2, 1))[known]
-    wide = np.full(tool.chain.n_joints, np.inf)
-    controller = Reaching(tool.chain, moved[known], flange, check.place[0], None, -wide, wide)
+    known, flange = np.flatnonzero(usable), None
+    moved = aimed[known, :3, 3] + correction[known, :3]
+    if check.oriented:
+        turned = Rotation.from_rotvec(correction[known, 3:]).as_matrix() @ aimed[known, :3, :3]
+        flange = turned @ check.T_flange_tool[known, :3, :3].transpose(0, 2, 1)
+    wide, place = np.full(tool.chain.n_joints, np.inf), check.T_flange_tool[0, :3, 3]
+    controller = Reaching(tool.chain, moved, flange, place, None, -wide, wide)
     q = check.nominal.copy()
     q[known] = controller.solve(q[known], np.arange(len(known)))[0]
-    off = (_between(_achieved(tool, check, joints), aimed)[known] for joints in (check.nominal, q))
+    off = (_between(_achieved(tool, check, joints), aimed, check.oriented)[known]
+           for joints in (check.nominal, q))  # fmt: skip
     before, after = (np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in off)
     return before, after
 
