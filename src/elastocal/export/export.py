@@ -115,22 +115,10 @@ class Exported:
     T_tracker_base: Array
     framed: bool
     warnings: tuple[str, ...]
-    text: str = ""
+    text: str
     checked: float | None = None
     checked_with: str = ""
     without_beta: float | None = None
-
-    def written(
-        self, text: str, *told: str, read: tuple[float | None, str] = (None, "")
-    ) -> Exported:
-        warnings, (checked, how) = (*self.warnings, *told), read
-        return replace(self, text=text, warnings=warnings, checked=checked, checked_with=how)
-
-    @property
-    def base_told(self) -> str:
-        at = placed(self.T_tracker_base).values()
-        xyz, rpy = (" ".join(str(round(v, 9) + 0.0) for v in each) for each in at)
-        return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -200,20 +188,25 @@ def export(
         (cost.unsettled, f"{cost.unsettled} of {cost.poses} random poses have no static "
          "equilibrium under the load and are left out"),
     )  # fmt: skip
-    told = tuple(text for so, text in doubts if so)
-    done = Exported(
-        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
-        pieces.T_tracker_base, wish.base_frame, told,
-    )  # fmt: skip
+    told = [text for so, text in doubts if so]
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
-    written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
-    return written
+    made = getattr(_Writing(calibrated, wish, kept, pieces, cost), format)()
+    warnings = (*told, *made.pop("warnings", ()))
+    return Exported(
+        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
+        pieces.T_tracker_base, wish.base_frame, warnings, **made,
+    )  # fmt: skip
 
 
 def placed(T: Array) -> dict[str, list[float]]:
     """A placement (4, 4) as m and rad (roll, pitch, yaw)."""
     rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
     return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
+
+
+def base_told(T: Array) -> str:
+    xyz, rpy = (" ".join(str(round(v, 9) + 0.0) for v in each) for each in placed(T).values())
+    return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
@@ -241,6 +234,9 @@ POSES_AT_REST = 20
 CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
 
 
+Made = dict[str, Any]  # of `Exported`: the text, and what its format alone says
+
+
 @dataclass(frozen=True)
 class _Writing:
     """One arm in the formats there are, read back by the library that users read it with."""
@@ -249,9 +245,9 @@ class _Writing:
     wish: Wish
     kept: exportable.Kept
     pieces: exportable.ExportNumbers
-    done: Exported
+    cost: exportable.Cost
 
-    def parameters(self) -> Exported:
+    def parameters(self) -> Made:
         """Estimates, the geometry they make, and that geometry's cost.  Joint and flange placements
         are those of the calibrated URDF: in the frame before, in m and rad (roll, pitch, yaw),
         offsets included, so that joint values stay commanded ones."""
@@ -278,16 +274,16 @@ class _Writing:
                 "markers": {name: placed(T) for name, T in pieces.markers.items()},
                 "load_point_m": [float(v) for v in pieces.load_point],
             },
-            "geometry_alone": self.done.cost.to_json(),
+            "geometry_alone": self.cost.to_json(),
         }  # fmt: skip
         if self.wish.kind == "json":
-            return self.done.written(messages.json_text(document) + "\n")
+            return {"text": messages.json_text(document) + "\n"}
         import yaml
 
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
-        return self.done.written(text)
+        return {"text": text}
 
-    def corrections(self) -> Exported:
+    def corrections(self) -> Made:
         """Every smooth function over its range, with the half width of its 95 % band.  A row says
         by how much (urad or um) the place has moved beyond its commanded or identified position: of
         a joint its angle, of a link its end frame along and about its axes (components 1 to 6), of
@@ -318,7 +314,7 @@ class _Writing:
                     ))  # fmt: skip
         told = "this arm has no smooth function to be written as corrections; elastocal diagnose"
         require(rows, f"{arm.source}: {told} finds those that the readings show")
-        return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
+        return {"text": csv_text(CORRECTIONS_HEADER, rows, [self.note])}
 
     @property
     def note(self) -> str:
@@ -334,13 +330,14 @@ class _Writing:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
             low, high = rounded(sizes.min(), 4), rounded(sizes.max(), 4)
             span = high if low == high else f"{low} to {high}"
-            told += f", fitted where it was measured, under {span} N, {self.done.base_told}"
+            told += f", fitted where it was measured, under {span} N"
+            told += f", {base_told(self.pieces.T_tracker_base)}"
         return told
 
     def random(self, poses: int) -> Measurements:
         return random_table(self.kept.full.model, self.kept.conditions, poses, self.wish.seed)
 
-    def urdf(self) -> Exported:
+    def urdf(self) -> Made:
         robot, q = self.calibrated.model.cell.robot, self.random(100).q
         how = self.pieces, self.wish.frames, self.wish.base_frame, self.note
         if robot.urdf is not None:
@@ -367,11 +364,10 @@ class _Writing:
             )
             back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF"))
             found, reader = nominal_flanges(back.chain(*ends), q), "elastocal's reader of URDF"
-        return self.done.written(
-            text, *told, read=(_apart(found, nominal_flanges(chain, q)), reader)
-        )
+        apart = _apart(found, nominal_flanges(chain, q))
+        return {"text": text, "warnings": told, "checked": apart, "checked_with": reader}
 
-    def mjcf(self) -> Exported:
+    def mjcf(self) -> Made:
         robot, pieces, warnings = self.calibrated.model.cell.robot, self.pieces, []
         if robot.mjcf is not None:
             try:
@@ -396,11 +392,11 @@ class _Writing:
         warnings += self.rigid_joints(f" (gain {robot_files.RIGID:g})")
         if find_spec("mujoco") is None:
             lack = "not read back: MuJoCo is not installed (pip install elastocal[mujoco])"
-            return self.done.written(text, *warnings, lack)
+            return {"text": text, "warnings": [*warnings, lack]}
         placed = pieces.T_tracker_base if self.wish.base_frame else np.eye(4)
-        return self.done.written(text, *warnings, read=self.at_rest(MujocoRest(text), placed))
+        return {"text": text, "warnings": warnings} | self.at_rest(MujocoRest(text), placed)
 
-    def corrected(self, path: Path) -> Exported:
+    def corrected(self, path: Path) -> Made:
         cell, pieces = self.calibrated.model.cell, self.pieces
         if self.wish.base_frame:
             raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
@@ -428,7 +424,7 @@ class _Writing:
                 "own error would come on top"
             )
         text, told = robot_files.moved(path, text, self.wish.path.parent)
-        return self.done.written(text, *warnings, *told, read=read)
+        return {"text": text, "warnings": [*warnings, *told]} | read
 
     def rigid_joints(self, how: str) -> list[str]:
         springs, model = {s.site for s in self.pieces.springs}, self.kept.exported.model
@@ -440,7 +436,7 @@ class _Writing:
             rigid.setdefault(why, []).append(joint)
         return [f"{why} {', '.join(of)}: rigid in this file{how}" for why, of in rigid.items()]
 
-    def at_rest(self, rest: MujocoRest, T_world_base: Array) -> tuple[float, str]:
+    def at_rest(self, rest: MujocoRest, T_world_base: Array) -> Made:
         """Largest distance in m of flange and markers between MuJoCo at rest and the exported
         model, whose base is at `T_world_base` (4, 4) in the MJCF's world."""
         part, pieces, table = self.kept.exported, self.pieces, self.random(POSES_AT_REST)
@@ -451,9 +447,10 @@ class _Writing:
             if np.isfinite(T).all():
                 away = rest.points(q, force, pieces) - (pieces.points @ T[:3, :3].T + T[:3, 3])
                 worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
-        return _accepted(worst, LARGEST_AT_REST), "MuJoCo, at rest under the load"
+        checked = _accepted(worst, LARGEST_AT_REST)
+        return {"checked": checked, "checked_with": "MuJoCo, at rest under the load"}
 
-    def dh(self) -> Exported:
+    def dh(self) -> Made:
         convention, q = CONVENTIONS[self.wish.kind], self.random(100).q
         lines = dh_lines(self.calibrated.model.cell.robot, self.pieces, convention)
         expected = nominal_flanges(self.pieces.calibrated_chain(), q)
@@ -473,8 +470,8 @@ class _Writing:
             beta = checked(dh_csv(four), largest=np.inf)
             comments.append(f"without the column beta_rad: {rounded(beta * 1e6)} um")
         checked(text := dh_csv(lines, comments))
-        done = replace(self.done, without_beta=beta)
-        return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
+        reader = "elastocal's own reader of DH tables"
+        return {"text": text, "checked": apart, "checked_with": reader, "without_beta": beta}
 
 
 def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
@@ -644,13 +641,10 @@ def _decompose(chain: Chain, like: list[Array] | None = None) -> tuple[list[Arra
         for joint in chain.joints
     ]
     ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
-    starts = [np.eye(4), *turned]
-    rows: list[Array] = []
-    carried: Array = np.eye(4)
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        last = i == chain.n_joints
-        T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
-        old = None if like is None else like[i]
+    turned, rows, carried = [np.eye(4), *turned, np.eye(4)], list[Array](), np.eye(4)
+    for i, end in enumerate(ends):
+        last, old = i == chain.n_joints, None if like is None else like[i]
+        T = carried @ np.linalg.inv(turned[i]) @ end @ turned[i + 1]
         if last and old is not None:
             # The turn about and the shift along the axis that bring it closest to T.
             R = T[:3, :3] @ transform(old * TRAILING)[:3, :3].T

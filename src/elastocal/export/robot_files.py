@@ -18,23 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
-from elastocal.files import read_bytes
 from elastocal.messages import ElastocalError, InputError, listed, option, require
 from elastocal.model import mjcf
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.mjcf import AXES, SPRING, SPRING_OF_NEW, MjcfArm, import_mujoco, transform
-from elastocal.model.urdf import (
-    MAX_BYTES,
-    TRACKER,
-    Tag,
-    XmlFile,
-    comment,
-    element,
-    tree_of,
-    urdf_file,
-)  # fmt: skip
+from elastocal.model.urdf import TRACKER, Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 
@@ -580,8 +570,7 @@ class _MjcfText(XmlFile):
     order, the world first."""
 
     def __init__(self, arm: MjcfArm, pieces: ExportNumbers) -> None:
-        path = arm.tree.path
-        super().__init__(path, read_bytes(path, "MuJoCo model", MAX_BYTES), "an MJCF file")
+        super().__init__(arm.tree.path, arm.tree.path.read_bytes(), "an MJCF file")
         self.arm, self.model, self.pieces = arm, arm.model, pieces
         below = self.anywhere("body")
         self.bodies = [*self.anywhere("worldbody")[:1], *below]
