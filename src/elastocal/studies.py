@@ -36,7 +36,6 @@ from contextlib import closing, contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, partial
-from importlib.util import module_from_spec, spec_from_file_location
 from ipaddress import ip_address
 from itertools import islice
 from pathlib import Path
@@ -68,7 +67,7 @@ ASKED_FOR = {**dict(KINDS.values()), float: "a number"}  # how a type is asked f
 Row = dict[str, Any]
 Lines = Generator[Row, None, None]
 _LOCK = threading.Lock()
-_here: tuple[str, Path, ModuleType] | None = None  # digest, folder and study.py of what is loaded
+_here: tuple[str, Path] | None = None  # digest and folder of the study that is loaded
 
 
 class StudyFile(Table):
@@ -100,7 +99,7 @@ class Sources:
 
     @cached_property
     def digest(self) -> str:
-        return _hash(*(f"{name} {value}" for name, value in sorted(self.digests.items())))
+        return _hash(*map(" ".join, sorted(self.digests.items())))
 
 
 @dataclass(frozen=True)
@@ -220,20 +219,17 @@ def load(sources: Sources) -> ModuleType:
                         del sys.modules[name]
                 sys.path[:] = [place for place in sys.path if place != str(_here[1])]
                 importlib.invalidate_caches()
-            folder = _standing(sources)
-            sys.path.insert(0, str(folder))
-            name = f"elastocal_study_{sources.digest[:16]}"
-            spec: Any = spec_from_file_location(name, folder / "study.py")
-            module = module_from_spec(spec)
-            sys.modules[name] = module  # dataclasses and pickle look a class's module up there
-            _here = sources.digest, folder, module
-            # Nothing is left in the user's folder: no bytecode of its modules.
-            before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-            try:
-                calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
-            finally:
-                sys.dont_write_bytecode = before
-        return _here[2]
+            sys.modules.pop("study", None)  # of that name somebody else's
+            _here = sources.digest, _standing(sources)
+            sys.path.insert(0, str(_here[1]))
+        # Nothing is left in the user's folder: no bytecode of its modules.
+        before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+        try:
+            importing = partial(importlib.import_module, "study")
+            found: ModuleType = calling(_here[1], "importing study.py", importing)
+        finally:
+            sys.dont_write_bytecode = before
+        return found
 
 
 def _standing(sources: Sources) -> Path:
@@ -485,8 +481,9 @@ def _lines(
     than distributed.scheduler.allowed-failures."""
     waiting, out, died = deque(tasks), dict[Future[Row], Row](), Counter[int]()
     while out or (waiting and not stop.asked):
-        most = room() if waiting and not stop.asked else 0
-        while waiting and len(out) < min(most, 1 if died[waiting[0]["task"]] else most):
+        # Those that were out when a process died wait in front.
+        most = 0 if stop.asked or not waiting else 1 if died[waiting[0]["task"]] else room()
+        while waiting and len(out) < most:
             task = waiting.popleft()
             out[submit(execute, study.sources, task)] = task
         for future in wait(out, return_when=FIRST_COMPLETED).done:
@@ -643,7 +640,7 @@ def _known(study: Study, folder: Path, retry_failed: bool) -> tuple[list[Row], l
     failed = any(line["task_error"] for line in lines)
     earlier = list(before.get("earlier", []))
     if retry_failed and failed:
-        earlier.append(_hash(*(f"{n} {v}" for n, v in sorted(before.get("sources", {}).items()))))
+        earlier.append(_hash(*map(" ".join, sorted(before.get("sources", {}).items()))))
     for line in lines:
         at = line["task"]
         if at >= len(study.tasks) or study.tasks[at]["task_hash"] == line["task_hash"]:
