@@ -16,7 +16,7 @@ from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import listed, option, require, rounded
 from elastocal.model import calibrated
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, Conditions, ToolPoint, numbers
-from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.chain import check_posture, finite_ranges, joint_limits
 from elastocal.model.effects.base import COLUMNS
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
@@ -270,15 +270,10 @@ def _with_table(
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
     if text is None:
         return None
-    chain = arm.model.chain
-    n = chain.n_joints
+    chain, n = arm.model.chain, arm.model.chain.n_joints
     values = numbers(option("near"), text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
     values = values / in_file_units(np.ones(n), chain.kinds)
-    lower, upper = joint_limits(arm.model.cell, chain)
-    out = (values < lower) | (values > upper)
-    joint = f"joint {int(np.argmax(out)) + 1}"
-    told = f"{option('near')}: {joint} is beyond its limits; give a posture within them"
-    require(not out.any(), told)
+    check_posture(arm.model.cell, chain, option("near"), values, degrees=False)
     return values
 
 

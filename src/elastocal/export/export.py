@@ -124,15 +124,15 @@ class Exported:
         return {
             "schema": SCHEMA,
             "format": self.format,
-            "cannot_hold": self.cost.to_json(),
-            "refit": None if self.refit is None else self.refit.to_json(),
+            "cannot_hold": self.cost,
+            "refit": self.refit,
             "tracker_to_base": placed(self.T_tracker_base),
             "read_back": {"with": self.checked_with, "max_um": microns(self.checked)},
             "without_beta_max_um": microns(self.without_beta),
             "held": self.held,
-            "by_prior": list(self.by_prior),
-            "of_the_measurement": list(self.of_the_measurement),
-            "warnings": list(self.warnings),
+            "by_prior": self.by_prior,
+            "of_the_measurement": self.of_the_measurement,
+            "warnings": self.warnings,
         }
 
 
@@ -175,8 +175,9 @@ def export(
     held = {p.name: plain(e.get("held")) for p, e in each
             if not p.shrunk and e.get("identifiable") is not True}  # fmt: skip
     spec, loads = calibrated.model.cell.model, len(cost.forces)
+    fitted = refit is not None and refit.taken
     doubts = (
-        (kept.fitted and loads > 1 and not kept.exported.elastic,
+        (fitted and loads > 1 and not kept.exported.elastic,
          f"the arm sags under its load and this file cannot: it is fitted to all {loads} loads "
          f"measured; state {option('load')} for the one that it is for"),
         (calibrated.elastic and not cost.forces.any() and not spec.link_gravity,
@@ -190,7 +191,7 @@ def export(
     )  # fmt: skip
     told = [text for so, text in doubts if so]
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
-    made = getattr(_Writing(calibrated, wish, kept, pieces, cost), format)()
+    made = getattr(_Writing(calibrated, wish, kept, pieces, cost, fitted), format)()
     warnings = (*told, *made.pop("warnings", ()))
     return Exported(
         wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
@@ -246,6 +247,7 @@ class _Writing:
     kept: exportable.Kept
     pieces: exportable.ExportNumbers
     cost: exportable.Cost
+    fitted: bool
 
     def parameters(self) -> Made:
         """Estimates, the geometry they make, and that geometry's cost.  Joint and flange placements
@@ -253,29 +255,29 @@ class _Writing:
         offsets included, so that joint values stay commanded ones."""
         pieces, model = self.pieces, self.calibrated.model
         chain, cell = pieces.calibrated_chain(), model.cell
-        document = {
+        document = plain({
             "schema": PARAMETERS,
             "robot": chain.name,
             "cell": None if cell.path is None else Path(cell.path).name,
             "result": Path(self.calibrated.source).name,
             "units": "SI: m, rad, N, kg",
             "parameters": [  # what an older result does not have is null
-                {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
+                {"name": name} | {key: entry.get(key) for key in KEYS}
                 for name, entry in zip(model.names, self.calibrated.entries, strict=True)
             ],
             "geometry": {
                 "tracker_to_base": placed(pieces.T_tracker_base),
                 "joints": [
                     {"name": joint.name, "kind": joint.kind, **placed(joint.placement),
-                     "axis": [float(v) for v in joint.axis]}
+                     "axis": joint.axis}
                     for joint in chain.joints
                 ],
                 "flange": placed(chain.flange_placement),
                 "markers": {name: placed(T) for name, T in pieces.markers.items()},
-                "load_point_m": [float(v) for v in pieces.load_point],
+                "load_point_m": pieces.load_point,
             },
-            "geometry_alone": self.cost.to_json(),
-        }  # fmt: skip
+            "geometry_alone": self.cost,
+        })  # fmt: skip
         if self.wish.kind == "json":
             return {"text": messages.json_text(document) + "\n"}
         import yaml
@@ -326,7 +328,7 @@ class _Writing:
             told += f", at {conditions.temperature:g} °C"
         if conditions.time is not None:
             told += f", at {conditions.time:g} s"
-        if self.kept.fitted and conditions.visits is not None:
+        if self.fitted and conditions.visits is not None:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
             low, high = rounded(sizes.min(), 4), rounded(sizes.max(), 4)
             span = high if low == high else f"{low} to {high}"

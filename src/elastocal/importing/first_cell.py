@@ -143,6 +143,7 @@ def first_cell(robot: Robot, folder: Path) -> str:
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
     arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None
+    tree = None if kind == "dh" else check_urdf(path) if arm is None else arm.tree
     reach = max(reach_of(chain), 0.05)
     if clashing(chain) and robot.joint_names is None:
         robot = replace(robot, joint_names="order")
@@ -155,7 +156,9 @@ def first_cell(robot: Robot, folder: Path) -> str:
         "",
         *_robot(robot, kind, path, folder),
         *_joints(chain),
-        REST.format(**_guesses(chain, reach, *_mount(robot, arm)), **_tool(robot, reach, arm)),
+        REST.format(
+            **_guesses(chain, reach, *_mount(robot, tree, arm)), **_tool(robot, reach, tree)
+        ),
     ]
     return "\n".join(lines)
 
@@ -209,14 +212,13 @@ def placeholder_masses(chain: Chain) -> str:
     )
 
 
-def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
+def _mount(robot: Robot, tree: Tree | None, arm: MjcfArm | None) -> tuple[Array, str]:
     """T (4, 4) of the base in a frame whose z is up, as the file has it, and who says so."""
     if arm is not None:
         up, told = arm.upright()
         return pose_at(np.zeros(3), up) @ arm.tree.placed(arm.base), told
-    if robot.urdf is None:
+    if tree is None:
         return np.eye(4), "guess: the base stands upright"
-    tree = check_urdf(robot.urdf)
     base = tree.root if robot.base is None else robot.base
     T, told = tree.placed(base), f"of '{base}' in the file's '{tree.root}', z up"
     return (T if tree.root in WORLDS else pose_at(np.zeros(3), T[:3, :3])), told
@@ -254,13 +256,8 @@ def _joints(chain: Chain) -> Iterator[str]:
     yield ""
 
 
-def _tool(robot: Robot, reach: float, arm: MjcfArm | None) -> dict[str, str]:
-    there: dict[str, Array] = {}
-    if arm is not None:
-        there = arm.tree.places(arm.base, arm.flange)
-    elif robot.urdf is not None:
-        tree = check_urdf(robot.urdf)
-        there = tree.places(*tree.ends(robot.base, robot.flange))
+def _tool(robot: Robot, reach: float, tree: Tree | None) -> dict[str, str]:
+    there = {} if tree is None else tree.places(*tree.ends(robot.base, robot.flange))
     usable = {n: p for n, p in there.items() if n == n.strip() == printable(n)}
     told, side, digits = "the model's sites; keep the reflectors", reach / 12, 4
     # Off the last joint's axis, which a load on it would not turn.
