@@ -292,19 +292,19 @@ class _Writing:
         the base along and about the data's axes, of a marker its position in the flange frame.
         `position_deg` or `time_s` is what it follows."""
         arm, rows = self.calibrated, list[tuple[str, ...]]()
-        names, place = arm.model.names, {n: k for k, n in enumerate(arm.determined)}
         quantile = float(t_quantile(LEVEL, np.array(np.inf)))
+        at = [arm.model.names.index(name) for name in arm.determined]
+        covariance = np.zeros((len(arm.x), len(arm.x)))
+        covariance[np.ix_(at, at)] = arm.covariance
         for group in smooth_groups(arm.model):
-            if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+            if group.basis is None or not np.isin(group.columns, at).any():
                 continue
             steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
             x = group.grid(min(max(steps + 1, FEWEST), MOST))
             waves = group.basis(x)
             for number, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
-                known = np.array([names[c] in place for c in columns])
-                at = [place[names[c]] for c in columns[known]]
-                own = waves[:, known]
-                variance = np.einsum("nk,kl,nl->n", own, arm.covariance[np.ix_(at, at)], own)
+                own = covariance[np.ix_(columns, columns)]
+                variance = np.einsum("nk,kl,nl->n", waves, own, waves)
                 half = quantile * np.sqrt(np.maximum(variance, 0.0))
                 for position, *sizes in zip(x, waves @ arm.x[columns], half, strict=True):
                     angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"

@@ -28,7 +28,7 @@ from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometr
 from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import highest_origins, reach_of, suitable_load
+from elastocal.model.rigid import drawn_joints, highest_origins, reach_of, suitable_load
 from elastocal.model.urdf import TRACKER, Tree, XmlFile, check_urdf, is_called, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
@@ -242,17 +242,13 @@ def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
 
 def _joints(chain: Chain) -> Iterator[str]:
     yield f"[limits]                               # of {chain.n_joints} joints, in their order"
-    for i, joint in enumerate(chain.joints, 1):
-        turns, low, high = joint.kind == "revolute", joint.lower, joint.upper
-        unit, scale, whole = ("deg", math.degrees(1.0), 2 * math.pi) if turns else ("mm", 1e3, 1.0)
+    low, high, _ = drawn_joints(chain)
+    for i, (joint, ends) in enumerate(zip(chain.joints, zip(low, high, strict=True), strict=True)):
+        unit, scale = ("deg", math.degrees(1.0)) if joint.kind == "revolute" else ("mm", 1e3)
         told = f"{printable(joint.name)}, {joint.kind}"
-        if not (math.isfinite(low) and math.isfinite(high)):
-            told += "; the file has no limit: guess"
-            start = high - whole if math.isfinite(high) else -whole / 2
-            low = low if math.isfinite(low) else start
-            high = high if math.isfinite(high) else low + whole
-        ends = ", ".join(f"{value * scale:.6g}" for value in (low, high))
-        yield f"joint{i}_{unit} = [{ends}]".ljust(38) + f" # {told}"
+        told += "; the file has no limit: guess" * (ends != (joint.lower, joint.upper))
+        values = ", ".join(f"{value * scale:.6g}" for value in ends)
+        yield f"joint{i + 1}_{unit} = [{values}]".ljust(38) + f" # {told}"
     yield ""
 
 
