@@ -1,8 +1,5 @@
-"""A calibrated arm written in one of the formats, read back, and with what that costs.
-
-URDF and MJCF have a room of their own; DH tables, the parameters as YAML or JSON and the smooth
-functions are written here.
-"""
+"""A calibrated arm written in one of the formats, read back, and with what that costs; DH tables,
+parameters and smooth functions are made here, URDF and MJCF in robot_files."""
 
 from __future__ import annotations
 
@@ -52,11 +49,8 @@ MOST_POSES = 1_000_000
 @checked_arguments
 @dataclass(frozen=True)
 class Wish:
-    """How to export an arm to `path`, checked; the others are the options of `elastocal export`.
-
-    No format goes by the file's ending; costs are stated under `load` (3,) N at random `poses`;
-    `correct_joints`: with a joint correction.
-    """
+    """How to export an arm to `path`: the options of `elastocal export`, checked; costs are stated
+    under `load` (3,) N at random `poses`; `correct_joints`: with a joint correction."""
 
     path: Path
     format: str | None = None
@@ -139,11 +133,8 @@ class Exported:
 def export(
     calibrated: CalibratedArm, wish: Wish, progress: Callable[[str], None] = lambda _: None
 ) -> Exported:
-    """The calibrated arm as the text of a file.
-
-    Raises InsufficientDataError where no random pose has an equilibrium under the load, and
-    ElastocalError where the text, read back, is another arm than the model.
-    """
+    """Raises InsufficientDataError where no random pose has an equilibrium under the load, and
+    ElastocalError where the text, read back, is another arm than the model."""
     for asked, given, formats in (
         (option("base_frame"), wish.base_frame, FRAMED),
         (option("joint_correction"), wish.correct_joints, FITTED),
@@ -531,12 +522,10 @@ def near(row: Array, other: Array, tolerance: float = 1e-12) -> Array:
 
 
 def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Array, Array]:
-    """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.
-
-    (θ, a, α) and (θ ± π, −a, −α) say the same: taken is the one closer to `like`, else the one
-    with the smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of
-    `like`, else `height`.
-    """
+    """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.  (θ, a, α)
+    and (θ ± π, −a, −α) say the same: taken is the one closer to `like`, else the one with the
+    smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of `like`,
+    else `height`."""
     alike, height = (0.0, height) if like is None else like[:2].tolist()
     ways = [_row(T, sign, height, alike) for sign in (1.0, -1.0)]
 
@@ -571,16 +560,10 @@ def _row(T: Array, sign: float, d: float, alike: float) -> Array:
     return np.array([theta, d, a, math.atan2(-y, z[2]), math.atan2(x, math.hypot(y, z[2]))])
 
 
-# The calibrated arm as a Denavit–Hartenberg table, standard or modified.
-#
-# Calibration leaves neighbouring axes skew, so a table of four parameters per joint holds them;
-# where they are nearly parallel there is a column beta_rad.  Rows of type fixed carry what no joint
-# row can: where the first axis stands in the base frame, and the flange.  Numbers that calibration
-# did not change are those of the nominal arm.
-#
-# The chain is written as  L₀ X₀ · L₁(q₁) X₁ · … · L_n(q_n) X_n · F  with L = Rz(θ) Tz(d) and
-# X = Tx(a) Rx(α) Ry(β).  A standard row is an L with the X after it, a modified row an L with the
-# X before it.
+# The table: L₀ X₀ · L₁(q₁) X₁ · … · L_n(q_n) X_n · F  with L = Rz(θ) Tz(d), X = Tx(a) Rx(α) Ry(β).
+# A standard row is an L with the X after it, a modified row an L with the X before it.  Rows of
+# type fixed carry what no joint row can: where the first axis stands in the base frame, and the
+# flange.  Numbers that calibration did not change are those of the nominal arm.
 
 CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
 HEADER = ("joint", "type", "theta0_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
@@ -614,11 +597,8 @@ FORMULA = {
 
 
 def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
-    """CSV text of a table, which `[robot] dh` reads: angles in rad, lengths in m.
-
-    beta_rad stands there only where a row needs it; limits are those of commanded values; comments
-    begin with #.
-    """
+    """CSV text of a table, which `[robot] dh` reads: angles in rad, lengths in m.  beta_rad stands
+    there only where a row needs it; limits are those of commanded values."""
     found = list[dict[str, str]]()
     for name, joint, row in lines:
         stated = dict(zip(HEADER[2:], row.tolist(), strict=True))

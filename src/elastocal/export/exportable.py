@@ -1,5 +1,10 @@
 """What of a calibrated model a file can hold, what leaving the rest out costs, and the best that
-the file can do instead."""
+the file can do instead.
+
+Rigid formats (URDF, DH table) hold geometry; MJCF also holds linear springs and weights.  The full
+model less what a file cannot hold is again a `Model`, so a cost is the difference of two
+predictions of one and the same machinery.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +35,6 @@ from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
 from elastocal.units import Array, microns
 
-# What of the calibrated model a file can hold, as a model of its own beside the full one.
-#
-# A rigid format (URDF, DH table) holds geometry; MJCF also holds linear springs and weights.  The
-# full model less what it cannot hold is again a `Model`, of the same effects, so the cost of the
-# export is the difference of two predictions of one and the same machinery.
-
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
 OPTIONS = {"time": "time_s", "temperature": "temperature_c"}  # which state what an effect needs
@@ -56,11 +55,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Omission:
-    """One thing that the file cannot hold; `without` is the full model without it.
-
-    `without` is None where its cost cannot be stated, and `note` says why.  `difference` is what
-    leaving it out changes, once that is found.
-    """
+    """One thing that the file cannot hold; `without` is the full model without it, None where its
+    cost cannot be stated, and `note` says why; `difference` is what leaving it out changes, once
+    that is found."""
 
     effect: str
     note: str
@@ -71,9 +68,7 @@ class Omission:
 @dataclass(frozen=True)
 class Kept:
     """`full`: the calibrated arm; `exported`: what the file holds of it; `omissions` between.
-
-    `of_the_measurement`: effects of the instrument, which are no part of the arm; neither model
-    has them."""
+    `of_the_measurement`: effects of the instrument, which neither has."""
 
     full: Valued
     exported: Valued
@@ -83,11 +78,8 @@ class Kept:
 
 
 def keep(arm: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
-    """Split the calibrated model into what a rigid or an elastic format holds and the rest.
-
-    Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
-    file has no column of measured torques.
-    """
+    """Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
+    file has no column of measured torques."""
     instrument = tuple(name for name in arm.effects if CATALOGUE[name].of_the_measurement)
     unstated = calibrated.unstated_needs(arm, conditions)
     stated = {name for name, needs in unstated.items() if not needs}
@@ -138,17 +130,12 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     return Valued(model, np.array([values[name] for name in model.names])), changed
 
 
-# The numbers of an exported model: joint placements, markers, springs, masses.
-#
-# All of them are the expressions of the symbolic arm, evaluated; nothing is derived here a second
-# time.
-
 PAYLOAD = ("load.payload_scale", *(f"load.load_point_{k}" for k in "xyz"))
 
 
 @dataclass(frozen=True)
 class ExportNumbers:
-    """The arm in numbers, in SI units.
+    """The expressions of the symbolic arm, evaluated, in SI units.
 
     `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of the
     joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point` (3,) in
@@ -251,11 +238,8 @@ def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple
 
 
 def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
-    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes.
-
-    Joints beside the chain are held at zero, as when the chain was read.  Empty where the file
-    states no inertia that pinocchio can read.
-    """
+    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes,
+    joints beside the chain at zero; empty where pinocchio reads no inertia in the file."""
     import pinocchio as pin
 
     file, moving = urdf_file(path), {joint.name for joint in chain.joints}
@@ -272,12 +256,10 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
 
 @dataclass(frozen=True)
 class Cost:
-    """`total` between the full model and the file's, `effects` one by one, over `poses`.
-
-    Effects interact, so the total need not be their sum.  `unsettled`: poses without a static
-    equilibrium under the load, left out.  `forces` (L, 3) N act in turn; poses are
-    within the joints' `measured` ranges, else within their limits.
-    """
+    """`total` between the full model and the file's, `effects` one by one, over `poses`.  Effects
+    interact, so the total need not be their sum.  `unsettled`: poses without a static equilibrium
+    under the load, left out.  `forces` (L, 3) N act in turn; poses are within the joints'
+    `measured` ranges, else within their limits."""
 
     total: Difference
     effects: tuple[Omission, ...]
@@ -301,11 +283,8 @@ class Cost:
 
 
 def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
-    """Differences at `poses` random poses inside the joint limits, under the stated conditions.
-
-    A joint split into compliance levels stands at one of its levels, for which alone the full
-    model is identified.  Raises InsufficientDataError where no pose has an equilibrium.
-    """
+    """A joint split into compliance levels stands at one of its levels, for which alone the full
+    model is identified.  Raises InsufficientDataError where no pose has an equilibrium."""
     table = calibrated.random_table(kept.full.model, kept.conditions, poses, seed)
     # No omission touches the tool, so one set of markers serves every model.
     markers = evaluate_pieces(kept.exported, kept.conditions).points
@@ -471,11 +450,9 @@ def refitted(
     kept: Kept, poses: int, seed: int, correct: bool = False
 ) -> tuple[Kept, Refit | None, JointCorrection]:
     """`kept` with what the file holds fitted at the visits of its conditions, the errors, and with
-    `correct` what joints are to be commanded besides.
-
-    `kept` as it is, and no errors, where no visits are known, or where the file holds all of the
-    arm, or where no geometry was calibrated and no correction is asked for.
-    """
+    `correct` what joints are to be commanded besides; `kept` as it is, and no errors, where no
+    visits are known, or where the file holds all of the arm, or where no geometry was calibrated
+    and no correction is asked for."""
     conditions, part = kept.conditions, kept.exported
     own, visits = part.model.cell.model.effects, conditions.visits
     lacks = any(omission.without is not None for omission in kept.omissions)
