@@ -35,13 +35,11 @@ FRAMES: tuple[Frame, ...] = ("base", "tracker")
 
 @dataclass(frozen=True)
 class Targets:
-    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.
-
-    `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
-    rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
-    without a position the tool is to be where the nominal arm has it at q.  The arm goes from row
-    to row where they are a `path`; else nobody knows how it comes to each.
-    """
+    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.  `position`
+    (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`; rotation None:
+    any.  `q` (n, joints) is the nominal command, None where it is to be found; without a position
+    the tool is to be where the nominal arm has it at q.  The arm goes from row to row where they
+    are a `path`; else nobody knows how it comes to each."""
 
     table: Measurements
     frame: Frame
@@ -68,13 +66,11 @@ class Targets:
 def read_targets(
     path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
 ) -> Targets:
-    """Targets of a CSV or Parquet file whose columns are those of the measurement table.
-
-    x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone,
-    or both: joints are then the nominal command to start from.  force_x_N … and circumstances
-    (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
-    (3,) N acts where the table states none.
-    """
+    """Targets of a CSV or Parquet file whose columns are those of the measurement table: x_mm,
+    y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone, or both:
+    joints are then the nominal command to start from.  force_x_N … and circumstances (time_s,
+    approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force` (3,) N acts
+    where the table states none."""
     table = measurements.read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None
     placed, turned = table.position is not None, table.rotation is not None
@@ -120,8 +116,6 @@ def targets_at(
     table = Measurements.of_poses(source, np.zeros((n, 0)), np.zeros(3) if force is None else force)
     return Targets(table, frame, position, rotation, q)
 
-
-# The nominal command: what the robot would be commanded without calibration, along a path.
 
 STEP = 0.1  # rad or m between neighbours that count as one smooth piece
 LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer
@@ -201,8 +195,6 @@ def jumps(task: Reaching, q: Array, usable: BoolArray) -> IntArray:
     large = np.abs(step).max(axis=1) > LARGE
     return np.asarray(after[large & (np.linalg.norm(step, axis=1) > 3 * asked)])
 
-
-# Commanded joints that put the calibrated tool at its targets, near nominal commands.
 
 TOLERANCE = 1e-8  # m and rad within which a target counts as reached
 
@@ -305,14 +297,11 @@ def compensate(
     arm: CalibratedArm, targets: Targets, point: ToolPoint, near: Array | None = None,
     seed: int = 0, progress: Callable[[str], None] = lambda message: None,
 ) -> Compensation:  # fmt: skip
-    """Commanded joints that put the tool's point at the targets under their loads.
-
-    Targets in the base frame are taken to the data's frame by the base frame as identified.  The
+    """Targets in the base frame are taken to the data's frame by the base frame as identified.  The
     nominal command is the table's, or the nominal arm's inverse kinematics along the path, the
-    first place in the posture nearest to `near` (joints,).  The new command solves the
-    calibrated model for the target within the joint limits, nearest to the nominal one where
-    joints or a free rotation leave a choice.
-    """
+    first place in the posture nearest to `near` (joints,).  The new command solves the calibrated
+    model for the target within the joint limits, nearest to the nominal one where joints or a free
+    rotation leave a choice."""
     arm, of_one_campaign = calibrated.lasting(arm)
     tool = CalibratedTool(arm, point)
     chain, limits = tool.chain, joint_limits(tool.cell, tool.chain)
@@ -438,14 +427,12 @@ def _uncertainty(
     return Uncertainty(of_all[0], of_all[1], of_all[2], some.blamed)
 
 
-# Sentences about commands that are right but that somebody should look at.
-
+# Of commands that are right but that somebody should look at.
 AT_LIMIT = 1e-4  # rad or m; a controller stops before it
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
 LARGE_CORRECTION = np.radians(2.0)  # rad (or m) of a joint
 LEVEL_SLACK = 0.01  # rad or m
 WORTH_TELLING = 10e-6  # m
-
 UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
 
 
@@ -567,9 +554,7 @@ def _rows(targets: Targets, rows: IntArray) -> str:
 
 
 SCHEMA = "elastocal/compensation/1"
-# Of degrees and mm: 9e-12 rad and 5e-13 m.
-DIGITS = 9
-
+DIGITS = 9  # of degrees and mm: 9e-12 rad and 5e-13 m
 NAMED = 8  # rows that a message names
 
 
@@ -590,7 +575,7 @@ def check_status(
     lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
     if not lost:
         return
-    # That they are not reached has been said; why is told of each where the reasons differ.
+    # Why is told of each where the reasons differ.
     kinds = dict.fromkeys(s for _, s in lost)
     same = len(kinds) == 1
     named = some((row if same else f"{row} ({s})" for row, s in lost), NAMED)
@@ -682,9 +667,6 @@ def spread(values: Array) -> dict[str, float | None]:
     """Of values in m (rad), in µm (µrad)."""
     known = values[np.isfinite(values)] * 1e6
     if not len(known):
-        return {"rms": None, "p95": None, "max": None}
-    return {
-        "rms": float(np.sqrt(np.mean(known**2))),
-        "p95": float(np.quantile(known, 0.95)),
-        "max": float(known.max()),
-    }
+        return dict.fromkeys(("rms", "p95", "max"))
+    sizes = np.sqrt(np.mean(known**2)), np.quantile(known, 0.95), known.max()
+    return dict(zip(("rms", "p95", "max"), map(float, sizes), strict=True))

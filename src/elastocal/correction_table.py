@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal import compensation as single
-from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import listed, option, require, rounded
 from elastocal.model import calibrated
@@ -52,25 +51,21 @@ class CorrectionGrid:
 
 @dataclass(frozen=True)
 class CorrectionTable:
-    """`correction` (N, 6) m and rad to add to nominal targets at grid `points` (N, axes).
-
-    Position (dx, dy, dz) and rotation vector (drx, dry, drz) along the axes of the base frame:
-    the target becomes p + d, exp([dr]×) R.  NaN where there is none; `status` (N,) says why, and
-    which are EXACT or FIRST_ORDER.  `oriented`: whether rotations are corrected.
-    `before` and `between` (M, 2) m and rad: errors of the tool at M points between the grid's,
-    without the table and with the correction interpolated in it.  `sure`: of the tool's position
-    at the points, NaN where none is reached.  `warnings` are sentences.
-    """
+    """`correction` (N, 6) m and rad to add to nominal targets at grid `points` (N, axes), whose
+    commands are `made`: position (dx, dy, dz) and rotation vector (drx, dry, drz) along the axes of
+    the base frame, so that the target becomes p + d, exp([dr]×) R.  NaN where there is none;
+    `status` (N,) says why, and which are EXACT or FIRST_ORDER.  `before` and `between` (M, 2) m and
+    rad: errors of the tool at M points between the grid's, without the table and with the
+    correction interpolated in it.  `warnings` are sentences."""
 
     grid: CorrectionGrid
     points: Array
+    made: single.Compensation
     correction: Array
     status: tuple[str, ...]
-    oriented: bool
     before: Array
     between: Array
-    sure: Uncertainty
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
 
 
 def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[Array, ...]:
@@ -96,13 +91,11 @@ def correction_table(
     near: Array | None = None, seed: int = 0,
     progress: Callable[[str], None] = lambda message: None, frame: single.Frame = "base",
 ) -> CorrectionTable:  # fmt: skip
-    """The correction of every grid point under one `force` (3,) N, which stands in `frame`.
-
-    The command q_c that puts the calibrated tool at the nominal target is, for the controller's
-    nominal arm, the target T_nominal(q_c): the correction is what lies between the two (EXACT).
-    Beside singular postures and limits, where q_c is far from the nominal command or beyond
-    reach, it is the tool's error there with its sign changed (FIRST_ORDER).
-    """
+    """The correction of every grid point under one `force` (3,) N, which stands in `frame`.  The
+    command q_c that puts the calibrated tool at the nominal target is, for the controller's nominal
+    arm, the target T_nominal(q_c): the correction is what lies between the two (EXACT).  Beside
+    singular postures and limits, where q_c is far from the nominal command or beyond reach, it is
+    the tool's error there with its sign changed (FIRST_ORDER)."""
     from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
@@ -136,10 +129,7 @@ def correction_table(
         worse = "between the grid points the tool is farther off with the table than without it"
         finer = f"give more levels by {option('grid')}, or narrow [limits]"
         told = (*told, f"{worse}; do not use it: {finer}")
-    sure = result.uncertainty
-    return CorrectionTable(
-        grid, points, correction, status, result.oriented, before, between, sure, told
-    )
+    return CorrectionTable(grid, points, result, correction, status, before, between, told)
 
 
 def _sided(arm: CalibratedArm) -> tuple[str, ...]:
@@ -306,12 +296,9 @@ def grid_of(
     return CorrectionGrid(axes, False, turned)
 
 
-def summary_and_csv(
-    found: CorrectionTable, arm: CalibratedArm, partial: bool
-) -> tuple[dict[str, Any], str]:
-    """Summary of the correction table, and the table as CSV; refused where points are not
-    reached and `partial` does not allow for that."""
-    kinds = arm.model.chain.kinds
+def summary_and_csv(found: CorrectionTable, partial: bool) -> tuple[dict[str, Any], str]:
+    """Refused where points are not reached and `partial` does not allow for that."""
+    kinds, sure = found.made.chain.kinds, found.made.uncertainty
     heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
     if found.grid.joints:
         heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
@@ -333,7 +320,7 @@ def summary_and_csv(
     order = np.lexsort(found.points.T[::-1])
     moved, turned = found.correction[order, :3] * 1e3, np.degrees(found.correction[order, 3:])
     blocks = [(heads, points[order], ".9g"), (["dx_mm", "dy_mm", "dz_mm"], moved, ".7f")]
-    if found.oriented:
+    if found.made.oriented:
         blocks.append((["drx_deg", "dry_deg", "drz_deg"], turned, ".7f"))
     content: dict[str, Any] = {
         "points": len(found.status),
@@ -343,11 +330,11 @@ def summary_and_csv(
         "checked_between": len(found.between),
         "error_without_um": single.spread(found.before[:, 0]),
         "error_with_um": single.spread(found.between[:, 0]),
-        "std_um": single.spread(found.sure.std),
-        "within95_um": single.spread(found.sure.within),
+        "std_um": single.spread(sure.std),
+        "within95_um": single.spread(sure.within),
         "warnings": list(found.warnings),
     }
-    if found.oriented:
+    if found.made.oriented:
         content["rotation_without_urad"] = single.spread(found.before[:, 1])
         content["rotation_with_urad"] = single.spread(found.between[:, 1])
     return content, single.table_csv(blocks, [found.status[i] for i in order])
