@@ -4,6 +4,7 @@ error, the command near it that undoes it; with uncertainty and notices, as file
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +25,7 @@ from elastocal.model.chain import Chain, joint_index, joint_limits
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import BoundedSearch, Postures, Reaching, inverse_kinematics
 from elastocal.tables import column, csv_text
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray, IntArray, pose_at
 
 NEITHER = 1e-12  # the side that a joint came from where no move of it is known; 0 is a first visit
 
@@ -34,13 +35,11 @@ FRAMES: tuple[Frame, ...] = ("base", "tracker")
 
 @dataclass(frozen=True)
 class Targets:
-    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.
-
-    `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
-    rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
-    without a position the tool is to be where the nominal arm has it at q.  The arm goes from row
-    to row where they are a `path`; else nobody knows how it comes to each.
-    """
+    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.  `position`
+    (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`; rotation None:
+    any.  `q` (n, joints) is the nominal command, None where it is to be found; without a position
+    the tool is to be where the nominal arm has it at q.  The arm goes from row to row where they
+    are a `path`; else nobody knows how it comes to each."""
 
     table: Measurements
     frame: Frame
@@ -67,13 +66,11 @@ class Targets:
 def read_targets(
     path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
 ) -> Targets:
-    """Targets of a CSV or Parquet file whose columns are those of the measurement table.
-
-    x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone,
-    or both: joints are then the nominal command to start from.  force_x_N … and circumstances
-    (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
-    (3,) N acts where the table states none.
-    """
+    """Targets of a CSV or Parquet file whose columns are those of the measurement table: x_mm,
+    y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone, or both:
+    joints are then the nominal command to start from.  force_x_N … and circumstances (time_s,
+    approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force` (3,) N acts
+    where the table states none."""
     table = measurements.read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None
     placed, turned = table.position is not None, table.rotation is not None
@@ -119,8 +116,6 @@ def targets_at(
     table = Measurements.of_poses(source, np.zeros((n, 0)), np.zeros(3) if force is None else force)
     return Targets(table, frame, position, rotation, q)
 
-
-# The nominal command: what the robot would be commanded without calibration, along a path.
 
 STEP = 0.1  # rad or m between neighbours that count as one smooth piece
 LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer
@@ -201,42 +196,26 @@ def jumps(task: Reaching, q: Array, usable: BoolArray) -> IntArray:
     return np.asarray(after[large & (np.linalg.norm(step, axis=1) > 3 * asked)])
 
 
-# Commanded joints that put the calibrated tool at its targets, near nominal commands.
-
 TOLERANCE = 1e-8  # m and rad within which a target counts as reached
 
 
-@dataclass(frozen=True)
-class Goals:
-    """`position` (n, 3) m and `rotation` (n, 3, 3), or None for any, in the data's frame."""
-
-    position: Array
-    rotation: Array | None
-
-    def through(self, T: Array) -> Goals:
-        """These in the frame to which T (n, 4, 4) takes them."""
-        position = np.einsum("nij,nj->ni", T[:, :3, :3], self.position) + T[:, :3, 3]
-        return Goals(position, None if self.rotation is None else T[:, :3, :3] @ self.rotation)
-
-    def in_base(self, T: Array) -> Goals:
-        return self.through(np.asarray(np.linalg.inv(T)))
-
-
 class Commanding(BoundedSearch):
-    """r(q) of the calibrated tool against its goals, searched within the joint limits.  Its steps
-    have the least norm, so that from nominal commands, from which those wanted are a few
-    milliradians away, an arm with more joints than the task has equations stays next to them."""
+    """r(q) of the calibrated tool against its goals (n, 4, 4), of which positions alone count
+    unless `oriented`, searched within the joint limits.  Its steps have the least norm, so that
+    from nominal commands, from which those wanted are a few milliradians away, an arm with more
+    joints than the task has equations stays next to them."""
 
     def __init__(
-        self, tool: CalibratedTool, rows: list[NDArray], goals: Goals, lower: Array, upper: Array
-    ) -> None:
+        self, tool: CalibratedTool, rows: list[NDArray], goals: Array, oriented: bool,
+        lower: Array, upper: Array,
+    ) -> None:  # fmt: skip
         super().__init__(lower, upper)
-        self.tool, self.rows, self.goals = tool, rows, goals
+        self.tool, self.rows, self.goals, self.oriented = tool, rows, goals, oriented
 
     def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
-        rotation = None if self.goals.rotation is None else self.goals.rotation[target]
-        rows = [values[target] for values in self.rows]
-        return self.tool.errors(rows, q, self.goals.position[target], rotation)
+        rows, goals = [values[target] for values in self.rows], self.goals[target]
+        rotation = goals[:, :3, :3] if self.oriented else None
+        return self.tool.errors(rows, q, goals[:, :3, 3], rotation)
 
     def misses(self, q: Array, target: IntArray) -> Array:
         """Distance in m and angle in rad (R, 2) from the goals; NaN without an equilibrium."""
@@ -266,11 +245,11 @@ class Compensation(Result):
         status: (n,), of "reached", "limit", "no equilibrium" and "not reached".
         uncertainty: Of the tool's position, NaN where a row is not reached.
         warnings: What to know before one runs the commands, in sentences.
-        targets: The targets as given; `goals` are they in the data's frame.
+        targets: The targets as given.
         point: The tool's point.
+        goals: The tool's poses (n, 4, 4) in the data's frame, positions alone unless `oriented`.
         force: (n, 3) in N, in the data's frame.
-        T_data_base: (n, 4, 4).
-        place: (n, 3) in m, the point in the flange frame; `turned` (n, 3, 3) the tool's rotation.
+        T_data_base, T_flange_tool: (n, 4, 4).
         nominal_miss: (n,) in m, how far the nominal arm is from the target at the nominal command.
         chain: The nominal chain.
 
@@ -291,11 +270,11 @@ class Compensation(Result):
     after: Array
     turn: Array
     status: tuple[str, ...]
-    goals: Goals
+    goals: Array
+    oriented: bool
     force: Array
     T_data_base: Array
-    place: Array
-    turned: Array
+    T_flange_tool: Array
     nominal_miss: Array
     uncertainty: Uncertainty
     warnings: tuple[str, ...]
@@ -318,42 +297,46 @@ def compensate(
     arm: CalibratedArm, targets: Targets, point: ToolPoint, near: Array | None = None,
     seed: int = 0, progress: Callable[[str], None] = lambda message: None,
 ) -> Compensation:  # fmt: skip
-    """Commanded joints that put the tool's point at the targets under their loads.
-
-    Targets in the base frame are taken to the data's frame by the base frame as identified.  The
+    """Targets in the base frame are taken to the data's frame by the base frame as identified.  The
     nominal command is the table's, or the nominal arm's inverse kinematics along the path, the
-    first place in the posture nearest to `near` (joints,).  The new command solves the
-    calibrated model for the target within the joint limits, nearest to the nominal one where
-    joints or a free rotation leave a choice.
-    """
+    first place in the posture nearest to `near` (joints,).  The new command solves the calibrated
+    model for the target within the joint limits, nearest to the nominal one where joints or a free
+    rotation leave a choice."""
     arm, of_one_campaign = calibrated.lasting(arm)
     tool = CalibratedTool(arm, point)
     chain, limits = tool.chain, joint_limits(tool.cell, tool.chain)
-    T, place, turn = tool.frames(tool.rows(targets.table))
-    force = targets.table.force
-    if targets.frame == "base":
-        force = np.einsum("nij,nj->ni", T[:, :3, :3], force)
-    goals = _goals(targets, chain, T, place, turn)
-    aimed = goals.in_base(T)
-    flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
-    task = Reaching(chain, aimed.position, flange, place[0], None, *limits)
-    if targets.q is None:
-        progress("nominal commands")
-        nominal = nominal_path(chain, aimed.position, flange, place[0], limits, near, seed)[0]
+    T, placed = tool.frames(tool.rows(targets.table))
+    force, q = targets.table.force, targets.q
+    if targets.position is not None:
+        _check_unit(targets, targets.position, chain, T)
+        goals, oriented = pose_at(targets.position, targets.rotation), targets.rotation is not None
     else:
-        check_limits(arm.model, replace(targets.table, q=targets.q))
-        nominal = np.clip(targets.q, *limits)
+        assert q is not None  # read_targets: positions or joints
+        # Fewer than six joints cannot keep the rotation too.
+        goals, oriented = rigid.nominal_flanges(chain, q) @ placed, chain.n_joints >= 6
+    if targets.frame == "base":
+        goals, force = T @ goals, np.einsum("nij,nj->ni", T[:, :3, :3], force)
+    aimed = np.linalg.inv(T) @ goals
+    flange = (aimed @ np.linalg.inv(placed))[:, :3, :3] if oriented else None
+    position, place = aimed[:, :3, 3], placed[0, :3, 3]
+    task = Reaching(chain, position, flange, place, None, *limits)
+    if q is None:
+        progress("nominal commands")
+        nominal = nominal_path(chain, position, flange, place, limits, near, seed)[0]
+    else:
+        check_limits(arm.model, replace(targets.table, q=q))
+        nominal = np.clip(q, *limits)
     progress("commands")
     every = np.arange(len(targets))
     rows = tool.rows(targets.moved(nominal, force))
-    search = Commanding(tool, rows, goals, *limits)
+    search = Commanding(tool, rows, goals, oriented, *limits)
     q, after = search.commands(nominal, every)
     lost = np.flatnonzero(~_is_reached(after))
     if targets.q is None and len(lost):
         progress(f"other postures for {len(lost)} points")
         nominal[lost] = _other_postures(
-            search, chain, aimed.position[lost], None if flange is None else flange[lost],
-            place[0], lost, nominal[lost], seed,
+            search, chain, position[lost], None if flange is None else flange[lost], place, lost,
+            nominal[lost], seed,
         )  # fmt: skip
         q[lost], after[lost] = search.commands(nominal[lost], lost)
     search.rows = tool.rows(targets.moved(q, force))
@@ -364,7 +347,7 @@ def compensate(
     result = Compensation(
         chain, targets, point, q, nominal, before[:, 0], after[:, 0],
         np.column_stack([before[:, 1], after[:, 1]]), _status(search, after, nominal), goals,
-        force, T, place, turn, task.errors(nominal, every)[0],
+        oriented, force, T, placed, task.errors(nominal, every)[0],
         _uncertainty(tool, search.rows, q, reached), (),
     )  # fmt: skip
     told = [*_of_loads(arm, result), *_of_places(arm, result)]
@@ -378,18 +361,6 @@ def compensate(
             "one campaign and no part of these commands."
         )
     return replace(result, warnings=tuple(told))
-
-
-def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
-    if targets.position is not None:
-        _check_unit(targets, targets.position, chain, T)
-        goals = Goals(targets.position, targets.rotation)
-    else:
-        assert targets.q is not None  # read_targets: positions or joints
-        # Fewer than six joints cannot keep the rotation too.
-        goals = Goals(place, turn if chain.n_joints >= 6 else None)
-        goals = goals.through(rigid.nominal_flanges(chain, targets.q))
-    return goals.through(T) if targets.frame == "base" else goals
 
 
 NOWHERE = 100.0  # of the reach nearer to the origin, or as many reaches away: no tool works there
@@ -440,8 +411,8 @@ def _status(search: Commanding, missed: Array, nominal: Array) -> tuple[str, ...
     status = np.where(reached, REACHED, np.where(lost, NO_EQUILIBRIUM, NOT_REACHED)).astype(object)
     left = np.flatnonzero(~reached & ~lost)
     if len(left):
-        wide = np.full(nominal.shape[1], np.inf)
-        free = Commanding(search.tool, search.rows, search.goals, -wide, wide)
+        free = copy(search)
+        free.lower, free.upper = np.tile([[-np.inf], [np.inf]], nominal.shape[1])
         status[left[_is_reached(free.commands(nominal[left], left)[1])]] = LIMIT
     return tuple(status)
 
@@ -456,14 +427,12 @@ def _uncertainty(
     return Uncertainty(of_all[0], of_all[1], of_all[2], some.blamed)
 
 
-# Sentences about commands that are right but that somebody should look at.
-
+# Of commands that are right but that somebody should look at.
 AT_LIMIT = 1e-4  # rad or m; a controller stops before it
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
 LARGE_CORRECTION = np.radians(2.0)  # rad (or m) of a joint
 LEVEL_SLACK = 0.01  # rad or m
 WORTH_TELLING = 10e-6  # m
-
 UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
 
 
@@ -585,9 +554,7 @@ def _rows(targets: Targets, rows: IntArray) -> str:
 
 
 SCHEMA = "elastocal/compensation/1"
-# Of degrees and mm: 9e-12 rad and 5e-13 m.
-DIGITS = 9
-
+DIGITS = 9  # of degrees and mm: 9e-12 rad and 5e-13 m
 NAMED = 8  # rows that a message names
 
 
@@ -608,7 +575,7 @@ def check_status(
     lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
     if not lost:
         return
-    # That they are not reached has been said; why is told of each where the reasons differ.
+    # Why is told of each where the reasons differ.
     kinds = dict.fromkeys(s for _, s in lost)
     same = len(kinds) == 1
     named = some((row if same else f"{row} ({s})" for row, s in lost), NAMED)
@@ -637,7 +604,7 @@ def commands_csv(result: Compensation) -> str:
     blocks.append((joint_columns(kinds, "correction_"), change, f".{DIGITS}f"))
     errors = np.column_stack([result.before, result.after]) * 1e6
     blocks.append((["error_before_um", "error_after_um"], errors, ".4g"))
-    if result.goals.rotation is not None:
+    if result.oriented:
         heads = ["error_rotation_before_urad", "error_rotation_after_urad"]
         blocks.append((heads, result.turn * 1e6, ".4g"))
     sure = np.column_stack([result.uncertainty.std, result.uncertainty.within]) * 1e6
@@ -700,9 +667,6 @@ def spread(values: Array) -> dict[str, float | None]:
     """Of values in m (rad), in µm (µrad)."""
     known = values[np.isfinite(values)] * 1e6
     if not len(known):
-        return {"rms": None, "p95": None, "max": None}
-    return {
-        "rms": float(np.sqrt(np.mean(known**2))),
-        "p95": float(np.quantile(known, 0.95)),
-        "max": float(known.max()),
-    }
+        return dict.fromkeys(("rms", "p95", "max"))
+    sizes = np.sqrt(np.mean(known**2)), np.quantile(known, 0.95), known.max()
+    return dict(zip(("rms", "p95", "max"), map(float, sizes), strict=True))

@@ -11,16 +11,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal import compensation as single
-from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import listed, option, require, rounded
 from elastocal.model import calibrated
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, Conditions, ToolPoint, numbers
-from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.chain import check_posture, finite_ranges, joint_limits
 from elastocal.model.effects.base import COLUMNS
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, pose_at
 
 LEAST_STEP = 1e-9  # m between levels
 MOST_POINTS = 200_000
@@ -52,25 +51,21 @@ class CorrectionGrid:
 
 @dataclass(frozen=True)
 class CorrectionTable:
-    """`correction` (N, 6) m and rad to add to nominal targets at grid `points` (N, axes).
-
-    Position (dx, dy, dz) and rotation vector (drx, dry, drz) along the axes of the base frame:
-    the target becomes p + d, exp([dr]×) R.  NaN where there is none; `status` (N,) says why, and
-    which are EXACT or FIRST_ORDER.  `oriented`: whether rotations are corrected.
-    `before` and `between` (M, 2) m and rad: errors of the tool at M points between the grid's,
-    without the table and with the correction interpolated in it.  `sure`: of the tool's position
-    at the points, NaN where none is reached.  `warnings` are sentences.
-    """
+    """`correction` (N, 6) m and rad to add to nominal targets at grid `points` (N, axes), whose
+    commands are `made`: position (dx, dy, dz) and rotation vector (drx, dry, drz) along the axes of
+    the base frame, so that the target becomes p + d, exp([dr]×) R.  NaN where there is none;
+    `status` (N,) says why, and which are EXACT or FIRST_ORDER.  `before` and `between` (M, 2) m and
+    rad: errors of the tool at M points between the grid's, without the table and with the
+    correction interpolated in it.  `warnings` are sentences."""
 
     grid: CorrectionGrid
     points: Array
+    made: single.Compensation
     correction: Array
     status: tuple[str, ...]
-    oriented: bool
     before: Array
     between: Array
-    sure: Uncertainty
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...]
 
 
 def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[Array, ...]:
@@ -96,25 +91,22 @@ def correction_table(
     near: Array | None = None, seed: int = 0,
     progress: Callable[[str], None] = lambda message: None, frame: single.Frame = "base",
 ) -> CorrectionTable:  # fmt: skip
-    """The correction of every grid point under one `force` (3,) N, which stands in `frame`.
-
-    The command q_c that puts the calibrated tool at the nominal target is, for the controller's
-    nominal arm, the target T_nominal(q_c): the correction is what lies between the two (EXACT).
-    Beside singular postures and limits, where q_c is far from the nominal command or beyond
-    reach, it is the tool's error there with its sign changed (FIRST_ORDER).
-    """
+    """The correction of every grid point under one `force` (3,) N, which stands in `frame`.  The
+    command q_c that puts the calibrated tool at the nominal target is, for the controller's nominal
+    arm, the target T_nominal(q_c): the correction is what lies between the two (EXACT).  Beside
+    singular postures and limits, where q_c is far from the nominal command or beyond reach, it is
+    the tool's error there with its sign changed (FIRST_ORDER)."""
     from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
     kept, points = calibrated.lasting(arm)[0], grid.points()
     sided, tool = _sided(kept), CalibratedTool(kept, point)
     if force is not None and frame == "tracker":
-        (T, *_), _, _ = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
+        ((T, *_), _) = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
         force = T[:3, :3].T @ force
     progress(f"{len(points)} grid points")
     result = single.compensate(arm, _targets(arm, grid, points, force), point, near, seed, progress)
     correction, status = _corrections(tool, result)
-    oriented = result.goals.rotation is not None
     before = between = np.zeros((0, 2))
     if any(len(axis) > 1 for axis in grid.axes):
         progress("between the grid points")
@@ -137,8 +129,7 @@ def correction_table(
         worse = "between the grid points the tool is farther off with the table than without it"
         finer = f"give more levels by {option('grid')}, or narrow [limits]"
         told = (*told, f"{worse}; do not use it: {finer}")
-    sure = result.uncertainty
-    return CorrectionTable(grid, points, correction, status, oriented, before, between, sure, told)
+    return CorrectionTable(grid, points, result, correction, status, before, between, told)
 
 
 def _sided(arm: CalibratedArm) -> tuple[str, ...]:
@@ -214,55 +205,54 @@ def _targets(
 def _corrections(
     tool: CalibratedTool, result: single.Compensation
 ) -> tuple[Array, tuple[str, ...]]:
-    aimed = result.goals.in_base(result.T_data_base)
-    nominal = single.Goals(result.place, result.turned).through(
-        nominal_flanges(tool.chain, result.q)
-    )
-    exact = _between(aimed, nominal)
-    achieved = _achieved(tool, result, result.nominal)
-    first_order = _between(achieved, aimed)
+    aimed = np.linalg.inv(result.T_data_base) @ result.goals
+    nominal = nominal_flanges(tool.chain, result.q) @ result.T_flange_tool
+    exact = _between(aimed, nominal, result.oriented)
+    first_order = _between(_achieved(tool, result, result.nominal), aimed, result.oriented)
     step = np.abs(result.q - result.nominal).max(axis=1)
     close = result.reached & (step <= single.LARGE_CORRECTION)
     # A nominal command that misses its own target is none that a correction could start from.
-    usable = np.isfinite(achieved.position).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
+    usable = np.isfinite(first_order).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
     correction = np.where(close[:, None], exact, first_order)
     correction[~(close | usable)] = np.nan
     status = np.where(close, EXACT, np.where(usable, FIRST_ORDER, result.status))
     return correction, tuple(status.tolist())
 
 
-def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> single.Goals:
+def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> Array:
+    """Where the tool is (n, 4, 4) in the base frame when commanded to q."""
     rows = tool.rows(result.targets.moved(q, result.force))
-    return single.Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
+    return np.linalg.inv(result.T_data_base) @ pose_at(*tool.poses(rows, q))
 
 
-def _between(one: single.Goals, other: single.Goals) -> Array:
-    """(n, 6) from one pose to another: p' − p, and the rotation vector of R' Rᵀ, zero where a
-    rotation is any."""
-    turned = np.zeros_like(one.position)
-    if one.rotation is not None and other.rotation is not None:
-        change = other.rotation @ one.rotation.transpose(0, 2, 1)
+def _between(one: Array, other: Array, oriented: bool) -> Array:
+    """(n, 6) from one pose (n, 4, 4) to another: p' − p, and the rotation vector of R' Rᵀ, zero
+    unless `oriented`."""
+    turned = np.zeros((len(one), 3))
+    if oriented:
+        change = other[:, :3, :3] @ one[:, :3, :3].transpose(0, 2, 1)
         good = np.isfinite(change).all(axis=(1, 2))
         turned[good] = Rotation.from_matrix(change[good]).as_rotvec()
-    return np.hstack([other.position - one.position, turned])
+    return np.hstack([other[:, :3, 3] - one[:, :3, 3], turned])
 
 
 def _with_table(
     tool: CalibratedTool, check: single.Compensation, correction: Array
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
-    aimed = check.goals.in_base(check.T_data_base)
+    aimed = np.linalg.inv(check.T_data_base) @ check.goals
     usable = np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
-    known = np.flatnonzero(usable)
-    moved, flange = aimed.position + correction[:, :3], None
-    if aimed.rotation is not None:
-        turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix()
-        flange = (turned @ aimed.rotation @ check.turned.transpose(0, 2, 1))[known]
-    wide = np.full(tool.chain.n_joints, np.inf)
-    controller = Reaching(tool.chain, moved[known], flange, check.place[0], None, -wide, wide)
+    known, flange = np.flatnonzero(usable), None
+    moved = aimed[known, :3, 3] + correction[known, :3]
+    if check.oriented:
+        turned = Rotation.from_rotvec(correction[known, 3:]).as_matrix() @ aimed[known, :3, :3]
+        flange = turned @ check.T_flange_tool[known, :3, :3].transpose(0, 2, 1)
+    wide, place = np.full(tool.chain.n_joints, np.inf), check.T_flange_tool[0, :3, 3]
+    controller = Reaching(tool.chain, moved, flange, place, None, -wide, wide)
     q = check.nominal.copy()
     q[known] = controller.solve(q[known], np.arange(len(known)))[0]
-    off = (_between(_achieved(tool, check, joints), aimed)[known] for joints in (check.nominal, q))
+    off = (_between(_achieved(tool, check, joints), aimed, check.oriented)[known]
+           for joints in (check.nominal, q))  # fmt: skip
     before, after = (np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in off)
     return before, after
 
@@ -270,15 +260,10 @@ def _with_table(
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
     if text is None:
         return None
-    chain = arm.model.chain
-    n = chain.n_joints
+    chain, n = arm.model.chain, arm.model.chain.n_joints
     values = numbers(option("near"), text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
     values = values / in_file_units(np.ones(n), chain.kinds)
-    lower, upper = joint_limits(arm.model.cell, chain)
-    out = (values < lower) | (values > upper)
-    joint = f"joint {int(np.argmax(out)) + 1}"
-    told = f"{option('near')}: {joint} is beyond its limits; give a posture within them"
-    require(not out.any(), told)
+    check_posture(arm.model.cell, chain, option("near"), values, degrees=False)
     return values
 
 
@@ -311,12 +296,9 @@ def grid_of(
     return CorrectionGrid(axes, False, turned)
 
 
-def summary_and_csv(
-    found: CorrectionTable, arm: CalibratedArm, partial: bool
-) -> tuple[dict[str, Any], str]:
-    """Summary of the correction table, and the table as CSV; refused where points are not
-    reached and `partial` does not allow for that."""
-    kinds = arm.model.chain.kinds
+def summary_and_csv(found: CorrectionTable, partial: bool) -> tuple[dict[str, Any], str]:
+    """Refused where points are not reached and `partial` does not allow for that."""
+    kinds, sure = found.made.chain.kinds, found.made.uncertainty
     heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
     if found.grid.joints:
         heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
@@ -338,7 +320,7 @@ def summary_and_csv(
     order = np.lexsort(found.points.T[::-1])
     moved, turned = found.correction[order, :3] * 1e3, np.degrees(found.correction[order, 3:])
     blocks = [(heads, points[order], ".9g"), (["dx_mm", "dy_mm", "dz_mm"], moved, ".7f")]
-    if found.oriented:
+    if found.made.oriented:
         blocks.append((["drx_deg", "dry_deg", "drz_deg"], turned, ".7f"))
     content: dict[str, Any] = {
         "points": len(found.status),
@@ -348,11 +330,11 @@ def summary_and_csv(
         "checked_between": len(found.between),
         "error_without_um": single.spread(found.before[:, 0]),
         "error_with_um": single.spread(found.between[:, 0]),
-        "std_um": single.spread(found.sure.std),
-        "within95_um": single.spread(found.sure.within),
+        "std_um": single.spread(sure.std),
+        "within95_um": single.spread(sure.within),
         "warnings": list(found.warnings),
     }
-    if found.oriented:
+    if found.made.oriented:
         content["rotation_without_urad"] = single.spread(found.before[:, 1])
         content["rotation_with_urad"] = single.spread(found.between[:, 1])
     return content, single.table_csv(blocks, [found.status[i] for i in order])

@@ -5,9 +5,10 @@
     frame = read_results("look")
 
 A study's folder holds `study.py` (what to compute) and `study.toml` (seed, options, columns).  What
-a worker needs of it travels as `Sources`; their hash, the seed and the task's values say
-whether a result on disk is of this very task.  Only the one process that the user started writes.
-However a run ends, what was done by then is kept, and the next one goes on from there.
+a worker needs of it travels as `Sources`; their hash, the seed and the task's values say whether a
+result on disk is of this very task.  Only the process that the user started writes, a line of JSON
+when a task ends: however a run ends, whole lines are left and at most the beginning of one, which
+the next run takes away and goes on from there.
 """
 
 from __future__ import annotations
@@ -36,7 +37,6 @@ from contextlib import closing, contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, partial
-from importlib.util import module_from_spec, spec_from_file_location
 from ipaddress import ip_address
 from itertools import islice
 from pathlib import Path
@@ -68,7 +68,7 @@ ASKED_FOR = {**dict(KINDS.values()), float: "a number"}  # how a type is asked f
 Row = dict[str, Any]
 Lines = Generator[Row, None, None]
 _LOCK = threading.Lock()
-_here: tuple[str, Path, ModuleType] | None = None  # digest, folder and study.py of what is loaded
+_here: tuple[str, Path] | None = None  # digest and folder of the study that is loaded
 
 
 class StudyFile(Table):
@@ -84,10 +84,9 @@ class StudyFile(Table):
 
 @dataclass(frozen=True)
 class Sources:
-    """The .py files of a study's folder and the files that study.toml names, by their names, and
-    what it states, with options and seed settled.  Sent to each worker: one that has the same
-    folder with the same contents uses it there, any other unpacks this one, so a cluster needs no
-    shared file system."""
+    """The .py files of a study's folder and the files that study.toml names, and what it states,
+    with options and seed settled.  A worker that has the same folder with the same contents uses it
+    there, any other unpacks this one, so a cluster needs no shared file system."""
 
     folder: Path
     contents: Mapping[str, bytes]
@@ -100,7 +99,7 @@ class Sources:
 
     @cached_property
     def digest(self) -> str:
-        return _hash(*(f"{name} {value}" for name, value in sorted(self.digests.items())))
+        return _hash(*map(" ".join, sorted(self.digests.items())))
 
 
 @dataclass(frozen=True)
@@ -220,20 +219,17 @@ def load(sources: Sources) -> ModuleType:
                         del sys.modules[name]
                 sys.path[:] = [place for place in sys.path if place != str(_here[1])]
                 importlib.invalidate_caches()
-            folder = _standing(sources)
-            sys.path.insert(0, str(folder))
-            name = f"elastocal_study_{sources.digest[:16]}"
-            spec: Any = spec_from_file_location(name, folder / "study.py")
-            module = module_from_spec(spec)
-            sys.modules[name] = module  # dataclasses and pickle look a class's module up there
-            _here = sources.digest, folder, module
-            # Nothing is left in the user's folder: no bytecode of its modules.
-            before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-            try:
-                calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
-            finally:
-                sys.dont_write_bytecode = before
-        return _here[2]
+            sys.modules.pop("study", None)  # of that name somebody else's
+            _here = sources.digest, _standing(sources)
+            sys.path.insert(0, str(_here[1]))
+        # Nothing is left in the user's folder: no bytecode of its modules.
+        before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+        try:
+            importing = partial(importlib.import_module, "study")
+            found: ModuleType = calling(_here[1], "importing study.py", importing)
+        finally:
+            sys.dont_write_bytecode = before
+        return found
 
 
 def _standing(sources: Sources) -> Path:
@@ -318,11 +314,6 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     return value
 
 
-# The results on disk: JSON lines, one for each task that ended, written by one process.
-#
-# A line is written when its task ends and says all of it: whatever stops a run leaves whole lines
-# and at most the beginning of one, which the next run takes away.
-
 MAX_BYTES = 100_000_000  # of the record
 MOST_RESULTS = 10_000_000_000  # bytes
 SCHEMA = "elastocal/study/1"
@@ -369,7 +360,6 @@ def as_text(line: Row) -> str:
 
 
 def result_lines(folder: Path) -> list[Row]:
-    """All whole lines in the order of their tasks; a killed run may leave the beginning of one."""
     path, found = folder / RESULTS, dict[int, Row]()
     text = read_text(path, "results", MOST_RESULTS) if path.exists() else ""
     for number, written in enumerate(text.split("\n")[:-1], 1):
@@ -396,11 +386,9 @@ def statement_of(folder: Path) -> dict[str, Any]:
 
 
 def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
-    """Returns the rows of a study, sorted by task and row; failed tasks only where `failed`.
-
-    Columns: task, task_hash, the task's values, task_row, the results, task_seconds, elastocal
-    (version), task_error. Raises InputError where there are none, or a result is there twice.
-    """
+    """The rows of a study, sorted by task and row; failed tasks only where `failed`.  Columns:
+    task, task_hash, the task's values, task_row, the results, task_seconds, elastocal (version),
+    task_error.  Raises InputError where there are none, or a result is there twice."""
     import pandas as pd
 
     found, columns = result_lines(Path(folder)), statement_of(Path(folder)).get("columns", {})
@@ -417,8 +405,6 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     numbers = [name for name, unit in columns.items() if unit not in KINDS]
     return frame.astype(dict.fromkeys(numbers, "float64"))
 
-
-# The run: tasks on joblib's processes or a Dask cluster, recorded as they come, stopped.
 
 ANSWER = 10.0  # s in which a scheduler answers
 MOST_PEM_BYTES = 1_000_000
@@ -485,8 +471,9 @@ def _lines(
     than distributed.scheduler.allowed-failures."""
     waiting, out, died = deque(tasks), dict[Future[Row], Row](), Counter[int]()
     while out or (waiting and not stop.asked):
-        most = room() if waiting and not stop.asked else 0
-        while waiting and len(out) < min(most, 1 if died[waiting[0]["task"]] else most):
+        # Those that were out when a process died wait in front.
+        most = 0 if stop.asked or not waiting else 1 if died[waiting[0]["task"]] else room()
+        while waiting and len(out) < most:
             task = waiting.popleft()
             out[submit(execute, study.sources, task)] = task
         for future in wait(out, return_when=FIRST_COMPLETED).done:
@@ -510,10 +497,8 @@ def _lines(
 def _security(
     distributed: Any, address: str, unencrypted: bool = False, **files: Path | None
 ) -> Any:
-    """For a client of `address`: with the `files` tls_ca, tls_cert and tls_key (PEM) or those of
-    Dask's configuration.  Whoever stands between could run code of their own here and there: tasks
-    and results are pickles.  So another host is reached by TLS only, unless `unencrypted` allows
-    it."""
+    """With the `files` tls_ca, tls_cert and tls_key (PEM) or those of Dask's configuration.  Tasks
+    and results are pickles, so another host is reached by TLS only, unless `unencrypted`."""
     keys = {"tls_ca": "tls_ca_file", "tls_cert": "tls_client_cert", "tls_key": "tls_client_key"}
     given = {}
     for name, path in files.items():
@@ -584,16 +569,13 @@ def run_study(
     stop: StudyStop | None = None, progress: Callable[[int, int, int], None] = lambda *told: None,
     tell: Callable[[str], None] = print, **way: Any,
 ) -> Ending:  # fmt: skip
-    """Run the tasks that have no result yet (of the first `only`) and record what comes.
-
-    They run in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`,
-    reached this `way` (tls_ca, tls_cert, tls_key, unencrypted).  `restart` discards the results in
-    the folder `output`, `retry_failed` those that are errors, also where study.py was corrected
-    since; `progress` takes the number of tasks, of those that ended and of those that failed.
-
-    Raises InputError where the results are of another study, or the cluster cannot be reached;
-    ClusterLostError where the scheduler goes away.
-    """
+    """Run the tasks that have no result yet (of the first `only`) and record what comes.  They run
+    in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`, reached
+    this `way` (tls_ca, tls_cert, tls_key, unencrypted).  `restart` discards the results in the
+    folder `output`, `retry_failed` those that are errors, also where study.py was corrected since;
+    `progress` takes the number of tasks, of those that ended and of those that failed.  Raises
+    InputError where the results are of another study, or the cluster cannot be reached;
+    ClusterLostError where the scheduler goes away."""
     folder, stop = Path(output), stop or StudyStop()
     with opened(folder):
         known, earlier = ([], []) if restart else _known(study, folder, retry_failed)
@@ -643,7 +625,7 @@ def _known(study: Study, folder: Path, retry_failed: bool) -> tuple[list[Row], l
     failed = any(line["task_error"] for line in lines)
     earlier = list(before.get("earlier", []))
     if retry_failed and failed:
-        earlier.append(_hash(*(f"{n} {v}" for n, v in sorted(before.get("sources", {}).items()))))
+        earlier.append(_hash(*map(" ".join, sorted(before.get("sources", {}).items()))))
     for line in lines:
         at = line["task"]
         if at >= len(study.tasks) or study.tasks[at]["task_hash"] == line["task_hash"]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Value = TypeVar("Value", float, NDArray[np.float64])
 
@@ -56,12 +56,12 @@ def microns(metres: float | None) -> float | None:
     return None if metres is None or not math.isfinite(metres) else metres * 1e6
 
 
-def pose_at(position: object, rotation: Array | None = None) -> Array:
-    """T (4, 4) of a position (3,) in m and a rotation (3, 3), None for none."""
-    T = np.eye(4)
-    T[:3, 3] = np.asarray(position)
+def pose_at(position: ArrayLike, rotation: Array | None = None) -> Array:
+    """T (…, 4, 4) of positions (…, 3) in m and rotations (…, 3, 3), None for none."""
+    T = np.tile(np.eye(4), (*np.shape(position)[:-1], 1, 1))
+    T[..., :3, 3] = position
     if rotation is not None:
-        T[:3, :3] = rotation
+        T[..., :3, :3] = rotation
     return T
 
 

@@ -60,10 +60,10 @@ def tool_errors(arm: CalibratedArm, found: Compensation, marker: str = "M1") -> 
         temperature=table.temperature,
     )  # fmt: skip
     rotation, position = arm.model.target_poses(rows, arm.x)
-    miss = np.linalg.norm(position - found.goals.position, axis=1)
-    if found.goals.rotation is None:
+    miss = np.linalg.norm(position - found.goals[:, :3, 3], axis=1)
+    if not found.oriented:
         return miss, np.zeros_like(miss)
-    turned = Rotation.from_matrix(found.goals.rotation.transpose(0, 2, 1) @ rotation)
+    turned = Rotation.from_matrix(found.goals[:, :3, :3].transpose(0, 2, 1) @ rotation)
     return miss, turned.magnitude()
 
 

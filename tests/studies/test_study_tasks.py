@@ -121,7 +121,7 @@ def with_parts(tmp_path):
 
 def test_a_worker_without_the_folder_unpacks_it(with_parts, tmp_path, monkeypatch):
     study = read_study(with_parts)
-    monkeypatch.setattr("elastocal.studies._here", ("", with_parts.resolve(), None))
+    monkeypatch.setattr("elastocal.studies._here", ("", with_parts.resolve()))
     elsewhere = replace(study.sources, folder=tmp_path / "not here")
     assert execute(elsewhere, study.tasks[0])["rows"][0]["mean"] == 42
     module = sys.modules["study_part_of_test"]

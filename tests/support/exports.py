@@ -10,8 +10,7 @@ import numpy as np
 
 from elastocal.cell import read_cell
 from elastocal.export.export import Exported, Wish, export
-from elastocal.export.exportable import Conditions, random_table
-from elastocal.model.calibrated import CalibratedArm, read_calibrated
+from elastocal.model.calibrated import CalibratedArm, Conditions, random_table, read_calibrated
 from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model

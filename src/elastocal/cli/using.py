@@ -293,7 +293,7 @@ def compensate(
         if lines is not None:
             how = tool_point(arm.model.cell, asked.get("point")), force, start, asked["seed"]
             made = grids.correction_table(arm, lines, *how, progress, asked["frame"])
-            content["table"], corrections = grids.summary_and_csv(made, arm, partial)
+            content["table"], corrections = grids.summary_and_csv(made, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(
             (output, lambda path: atomic_write(path, commands)),

@@ -1,8 +1,5 @@
-"""A calibrated arm written in one of the formats, read back, and with what that costs.
-
-URDF and MJCF have a room of their own; DH tables, the parameters as YAML or JSON and the smooth
-functions are written here.
-"""
+"""A calibrated arm written in one of the formats, read back, and with what that costs; DH tables,
+parameters and smooth functions are made here, URDF and MJCF in robot_files."""
 
 from __future__ import annotations
 
@@ -52,11 +49,8 @@ MOST_POSES = 1_000_000
 @checked_arguments
 @dataclass(frozen=True)
 class Wish:
-    """How to export an arm to `path`, checked; the others are the options of `elastocal export`.
-
-    No format goes by the file's ending; costs are stated under `load` (3,) N at random `poses`;
-    `correct_joints`: with a joint correction.
-    """
+    """How to export an arm to `path`: the options of `elastocal export`, checked; costs are stated
+    under `load` (3,) N at random `poses`; `correct_joints`: with a joint correction."""
 
     path: Path
     format: str | None = None
@@ -115,47 +109,32 @@ class Exported:
     T_tracker_base: Array
     framed: bool
     warnings: tuple[str, ...]
-    text: str = ""
+    text: str
     checked: float | None = None
     checked_with: str = ""
     without_beta: float | None = None
-
-    def written(
-        self, text: str, *told: str, read: tuple[float | None, str] = (None, "")
-    ) -> Exported:
-        warnings, (checked, how) = (*self.warnings, *told), read
-        return replace(self, text=text, warnings=warnings, checked=checked, checked_with=how)
-
-    @property
-    def base_told(self) -> str:
-        at = placed(self.T_tracker_base).values()
-        xyz, rpy = (" ".join(str(round(v, 9) + 0.0) for v in each) for each in at)
-        return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
 
     def to_json(self) -> dict[str, Any]:
         return {
             "schema": SCHEMA,
             "format": self.format,
-            "cannot_hold": self.cost.to_json(),
-            "refit": None if self.refit is None else self.refit.to_json(),
+            "cannot_hold": self.cost,
+            "refit": self.refit,
             "tracker_to_base": placed(self.T_tracker_base),
             "read_back": {"with": self.checked_with, "max_um": microns(self.checked)},
             "without_beta_max_um": microns(self.without_beta),
             "held": self.held,
-            "by_prior": list(self.by_prior),
-            "of_the_measurement": list(self.of_the_measurement),
-            "warnings": list(self.warnings),
+            "by_prior": self.by_prior,
+            "of_the_measurement": self.of_the_measurement,
+            "warnings": self.warnings,
         }
 
 
 def export(
     calibrated: CalibratedArm, wish: Wish, progress: Callable[[str], None] = lambda _: None
 ) -> Exported:
-    """The calibrated arm as the text of a file.
-
-    Raises InsufficientDataError where no random pose has an equilibrium under the load, and
-    ElastocalError where the text, read back, is another arm than the model.
-    """
+    """Raises InsufficientDataError where no random pose has an equilibrium under the load, and
+    ElastocalError where the text, read back, is another arm than the model."""
     for asked, given, formats in (
         (option("base_frame"), wish.base_frame, FRAMED),
         (option("joint_correction"), wish.correct_joints, FITTED),
@@ -187,8 +166,9 @@ def export(
     held = {p.name: plain(e.get("held")) for p, e in each
             if not p.shrunk and e.get("identifiable") is not True}  # fmt: skip
     spec, loads = calibrated.model.cell.model, len(cost.forces)
+    fitted = refit is not None and refit.taken
     doubts = (
-        (kept.fitted and loads > 1 and not kept.exported.elastic,
+        (fitted and loads > 1 and not kept.exported.elastic,
          f"the arm sags under its load and this file cannot: it is fitted to all {loads} loads "
          f"measured; state {option('load')} for the one that it is for"),
         (calibrated.elastic and not cost.forces.any() and not spec.link_gravity,
@@ -200,20 +180,25 @@ def export(
         (cost.unsettled, f"{cost.unsettled} of {cost.poses} random poses have no static "
          "equilibrium under the load and are left out"),
     )  # fmt: skip
-    told = tuple(text for so, text in doubts if so)
-    done = Exported(
-        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
-        pieces.T_tracker_base, wish.base_frame, told,
-    )  # fmt: skip
+    told = [text for so, text in doubts if so]
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
-    written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
-    return written
+    made = getattr(_Writing(calibrated, wish, kept, pieces, cost, fitted), format)()
+    warnings = (*told, *made.pop("warnings", ()))
+    return Exported(
+        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
+        pieces.T_tracker_base, wish.base_frame, warnings, **made,
+    )  # fmt: skip
 
 
 def placed(T: Array) -> dict[str, list[float]]:
     """A placement (4, 4) as m and rad (roll, pitch, yaw)."""
     rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
     return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
+
+
+def base_told(T: Array) -> str:
+    xyz, rpy = (" ".join(str(round(v, 9) + 0.0) for v in each) for each in placed(T).values())
+    return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
@@ -241,6 +226,9 @@ POSES_AT_REST = 20
 CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
 
 
+Made = dict[str, Any]  # of `Exported`: the text, and what its format alone says
+
+
 @dataclass(frozen=True)
 class _Writing:
     """One arm in the formats there are, read back by the library that users read it with."""
@@ -249,64 +237,65 @@ class _Writing:
     wish: Wish
     kept: exportable.Kept
     pieces: exportable.ExportNumbers
-    done: Exported
+    cost: exportable.Cost
+    fitted: bool
 
-    def parameters(self) -> Exported:
+    def parameters(self) -> Made:
         """Estimates, the geometry they make, and that geometry's cost.  Joint and flange placements
         are those of the calibrated URDF: in the frame before, in m and rad (roll, pitch, yaw),
         offsets included, so that joint values stay commanded ones."""
         pieces, model = self.pieces, self.calibrated.model
         chain, cell = pieces.calibrated_chain(), model.cell
-        document = {
+        document = plain({
             "schema": PARAMETERS,
             "robot": chain.name,
             "cell": None if cell.path is None else Path(cell.path).name,
             "result": Path(self.calibrated.source).name,
             "units": "SI: m, rad, N, kg",
             "parameters": [  # what an older result does not have is null
-                {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
+                {"name": name} | {key: entry.get(key) for key in KEYS}
                 for name, entry in zip(model.names, self.calibrated.entries, strict=True)
             ],
             "geometry": {
                 "tracker_to_base": placed(pieces.T_tracker_base),
                 "joints": [
                     {"name": joint.name, "kind": joint.kind, **placed(joint.placement),
-                     "axis": [float(v) for v in joint.axis]}
+                     "axis": joint.axis}
                     for joint in chain.joints
                 ],
                 "flange": placed(chain.flange_placement),
                 "markers": {name: placed(T) for name, T in pieces.markers.items()},
-                "load_point_m": [float(v) for v in pieces.load_point],
+                "load_point_m": pieces.load_point,
             },
-            "geometry_alone": self.done.cost.to_json(),
-        }  # fmt: skip
+            "geometry_alone": self.cost,
+        })  # fmt: skip
         if self.wish.kind == "json":
-            return self.done.written(messages.json_text(document) + "\n")
+            return {"text": messages.json_text(document) + "\n"}
         import yaml
 
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
-        return self.done.written(text)
+        return {"text": text}
 
-    def corrections(self) -> Exported:
+    def corrections(self) -> Made:
         """Every smooth function over its range, with the half width of its 95 % band.  A row says
         by how much (urad or um) the place has moved beyond its commanded or identified position: of
         a joint its angle, of a link its end frame along and about its axes (components 1 to 6), of
         the base along and about the data's axes, of a marker its position in the flange frame.
         `position_deg` or `time_s` is what it follows."""
         arm, rows = self.calibrated, list[tuple[str, ...]]()
-        names, place = arm.model.names, {n: k for k, n in enumerate(arm.determined)}
         quantile = float(t_quantile(LEVEL, np.array(np.inf)))
+        at = [arm.model.names.index(name) for name in arm.determined]
+        covariance = np.zeros((len(arm.x), len(arm.x)))
+        covariance[np.ix_(at, at)] = arm.covariance
         for group in smooth_groups(arm.model):
-            if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+            if group.basis is None or not np.isin(group.columns, at).any():
                 continue
             steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
             x = group.grid(min(max(steps + 1, FEWEST), MOST))
             waves = group.basis(x)
             for number, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
-                known = np.array([names[c] in place for c in columns])
-                at = [place[names[c]] for c in columns[known]]
-                own = waves[:, known]
-                variance = np.einsum("nk,kl,nl->n", own, arm.covariance[np.ix_(at, at)], own)
+                own = covariance[np.ix_(columns, columns)]
+                variance = np.einsum("nk,kl,nl->n", waves, own, waves)
                 half = quantile * np.sqrt(np.maximum(variance, 0.0))
                 for position, *sizes in zip(x, waves @ arm.x[columns], half, strict=True):
                     angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
@@ -318,7 +307,7 @@ class _Writing:
                     ))  # fmt: skip
         told = "this arm has no smooth function to be written as corrections; elastocal diagnose"
         require(rows, f"{arm.source}: {told} finds those that the readings show")
-        return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
+        return {"text": csv_text(CORRECTIONS_HEADER, rows, [self.note])}
 
     @property
     def note(self) -> str:
@@ -330,17 +319,18 @@ class _Writing:
             told += f", at {conditions.temperature:g} °C"
         if conditions.time is not None:
             told += f", at {conditions.time:g} s"
-        if self.kept.fitted and conditions.visits is not None:
+        if self.fitted and conditions.visits is not None:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
             low, high = rounded(sizes.min(), 4), rounded(sizes.max(), 4)
             span = high if low == high else f"{low} to {high}"
-            told += f", fitted where it was measured, under {span} N, {self.done.base_told}"
+            told += f", fitted where it was measured, under {span} N"
+            told += f", {base_told(self.pieces.T_tracker_base)}"
         return told
 
     def random(self, poses: int) -> Measurements:
         return random_table(self.kept.full.model, self.kept.conditions, poses, self.wish.seed)
 
-    def urdf(self) -> Exported:
+    def urdf(self) -> Made:
         robot, q = self.calibrated.model.cell.robot, self.random(100).q
         how = self.pieces, self.wish.frames, self.wish.base_frame, self.note
         if robot.urdf is not None:
@@ -367,11 +357,10 @@ class _Writing:
             )
             back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF"))
             found, reader = nominal_flanges(back.chain(*ends), q), "elastocal's reader of URDF"
-        return self.done.written(
-            text, *told, read=(_apart(found, nominal_flanges(chain, q)), reader)
-        )
+        apart = _apart(found, nominal_flanges(chain, q))
+        return {"text": text, "warnings": told, "checked": apart, "checked_with": reader}
 
-    def mjcf(self) -> Exported:
+    def mjcf(self) -> Made:
         robot, pieces, warnings = self.calibrated.model.cell.robot, self.pieces, []
         if robot.mjcf is not None:
             try:
@@ -396,11 +385,11 @@ class _Writing:
         warnings += self.rigid_joints(f" (gain {robot_files.RIGID:g})")
         if find_spec("mujoco") is None:
             lack = "not read back: MuJoCo is not installed (pip install elastocal[mujoco])"
-            return self.done.written(text, *warnings, lack)
+            return {"text": text, "warnings": [*warnings, lack]}
         placed = pieces.T_tracker_base if self.wish.base_frame else np.eye(4)
-        return self.done.written(text, *warnings, read=self.at_rest(MujocoRest(text), placed))
+        return {"text": text, "warnings": warnings} | self.at_rest(MujocoRest(text), placed)
 
-    def corrected(self, path: Path) -> Exported:
+    def corrected(self, path: Path) -> Made:
         cell, pieces = self.calibrated.model.cell, self.pieces
         if self.wish.base_frame:
             raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
@@ -428,7 +417,7 @@ class _Writing:
                 "own error would come on top"
             )
         text, told = robot_files.moved(path, text, self.wish.path.parent)
-        return self.done.written(text, *warnings, *told, read=read)
+        return {"text": text, "warnings": [*warnings, *told]} | read
 
     def rigid_joints(self, how: str) -> list[str]:
         springs, model = {s.site for s in self.pieces.springs}, self.kept.exported.model
@@ -440,7 +429,7 @@ class _Writing:
             rigid.setdefault(why, []).append(joint)
         return [f"{why} {', '.join(of)}: rigid in this file{how}" for why, of in rigid.items()]
 
-    def at_rest(self, rest: MujocoRest, T_world_base: Array) -> tuple[float, str]:
+    def at_rest(self, rest: MujocoRest, T_world_base: Array) -> Made:
         """Largest distance in m of flange and markers between MuJoCo at rest and the exported
         model, whose base is at `T_world_base` (4, 4) in the MJCF's world."""
         part, pieces, table = self.kept.exported, self.pieces, self.random(POSES_AT_REST)
@@ -451,9 +440,10 @@ class _Writing:
             if np.isfinite(T).all():
                 away = rest.points(q, force, pieces) - (pieces.points @ T[:3, :3].T + T[:3, 3])
                 worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
-        return _accepted(worst, LARGEST_AT_REST), "MuJoCo, at rest under the load"
+        checked = _accepted(worst, LARGEST_AT_REST)
+        return {"checked": checked, "checked_with": "MuJoCo, at rest under the load"}
 
-    def dh(self) -> Exported:
+    def dh(self) -> Made:
         convention, q = CONVENTIONS[self.wish.kind], self.random(100).q
         lines = dh_lines(self.calibrated.model.cell.robot, self.pieces, convention)
         expected = nominal_flanges(self.pieces.calibrated_chain(), q)
@@ -473,8 +463,8 @@ class _Writing:
             beta = checked(dh_csv(four), largest=np.inf)
             comments.append(f"without the column beta_rad: {rounded(beta * 1e6)} um")
         checked(text := dh_csv(lines, comments))
-        done = replace(self.done, without_beta=beta)
-        return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
+        reader = "elastocal's own reader of DH tables"
+        return {"text": text, "checked": apart, "checked_with": reader, "without_beta": beta}
 
 
 def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
@@ -532,12 +522,10 @@ def near(row: Array, other: Array, tolerance: float = 1e-12) -> Array:
 
 
 def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Array, Array]:
-    """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.
-
-    (θ, a, α) and (θ ± π, −a, −α) say the same: taken is the one closer to `like`, else the one
-    with the smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of
-    `like`, else `height`.
-    """
+    """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.  (θ, a, α)
+    and (θ ± π, −a, −α) say the same: taken is the one closer to `like`, else the one with the
+    smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of `like`,
+    else `height`."""
     alike, height = (0.0, height) if like is None else like[:2].tolist()
     ways = [_row(T, sign, height, alike) for sign in (1.0, -1.0)]
 
@@ -572,16 +560,10 @@ def _row(T: Array, sign: float, d: float, alike: float) -> Array:
     return np.array([theta, d, a, math.atan2(-y, z[2]), math.atan2(x, math.hypot(y, z[2]))])
 
 
-# The calibrated arm as a Denavit–Hartenberg table, standard or modified.
-#
-# Calibration leaves neighbouring axes skew, so a table of four parameters per joint holds them;
-# where they are nearly parallel there is a column beta_rad.  Rows of type fixed carry what no joint
-# row can: where the first axis stands in the base frame, and the flange.  Numbers that calibration
-# did not change are those of the nominal arm.
-#
-# The chain is written as  L₀ X₀ · L₁(q₁) X₁ · … · L_n(q_n) X_n · F  with L = Rz(θ) Tz(d) and
-# X = Tx(a) Rx(α) Ry(β).  A standard row is an L with the X after it, a modified row an L with the
-# X before it.
+# The table: L₀ X₀ · L₁(q₁) X₁ · … · L_n(q_n) X_n · F  with L = Rz(θ) Tz(d), X = Tx(a) Rx(α) Ry(β).
+# A standard row is an L with the X after it, a modified row an L with the X before it.  Rows of
+# type fixed carry what no joint row can: where the first axis stands in the base frame, and the
+# flange.  Numbers that calibration did not change are those of the nominal arm.
 
 CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
 HEADER = ("joint", "type", "theta0_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
@@ -615,11 +597,8 @@ FORMULA = {
 
 
 def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
-    """CSV text of a table, which `[robot] dh` reads: angles in rad, lengths in m.
-
-    beta_rad stands there only where a row needs it; limits are those of commanded values; comments
-    begin with #.
-    """
+    """CSV text of a table, which `[robot] dh` reads: angles in rad, lengths in m.  beta_rad stands
+    there only where a row needs it; limits are those of commanded values."""
     found = list[dict[str, str]]()
     for name, joint, row in lines:
         stated = dict(zip(HEADER[2:], row.tolist(), strict=True))
@@ -644,13 +623,10 @@ def _decompose(chain: Chain, like: list[Array] | None = None) -> tuple[list[Arra
         for joint in chain.joints
     ]
     ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
-    starts = [np.eye(4), *turned]
-    rows: list[Array] = []
-    carried: Array = np.eye(4)
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        last = i == chain.n_joints
-        T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
-        old = None if like is None else like[i]
+    turned, rows, carried = [np.eye(4), *turned, np.eye(4)], list[Array](), np.eye(4)
+    for i, end in enumerate(ends):
+        last, old = i == chain.n_joints, None if like is None else like[i]
+        T = carried @ np.linalg.inv(turned[i]) @ end @ turned[i + 1]
         if last and old is not None:
             # The turn about and the shift along the axis that bring it closest to T.
             R = T[:3, :3] @ transform(old * TRAILING)[:3, :3].T

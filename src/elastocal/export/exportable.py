@@ -1,5 +1,10 @@
 """What of a calibrated model a file can hold, what leaving the rest out costs, and the best that
-the file can do instead."""
+the file can do instead.
+
+Rigid formats (URDF, DH table) hold geometry; MJCF also holds linear springs and weights.  The full
+model less what a file cannot hold is again a `Model`, so a cost is the difference of two
+predictions of one and the same machinery.
+"""
 
 from __future__ import annotations
 
@@ -17,17 +22,8 @@ from elastocal.cell_tables import EffectChoice, Tool
 from elastocal.files import read_text
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError, InsufficientDataError, option, require
-from elastocal.model import rigid
-from elastocal.model.calibrated import (
-    RECORDED,
-    CalibratedArm,
-    Conditions,
-    Valued,
-    arm_with,
-    random_table,
-    table_at,
-    unstated_needs,
-)
+from elastocal.model import calibrated, rigid
+from elastocal.model.calibrated import CalibratedArm, Conditions, Valued
 from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.base import Format, Spring, row_inputs
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
@@ -38,12 +34,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
 from elastocal.units import Array, microns
-
-# What of the calibrated model a file can hold, as a model of its own beside the full one.
-#
-# A rigid format (URDF, DH table) holds geometry; MJCF also holds linear springs and weights.  The
-# full model less what it cannot hold is again a `Model`, of the same effects, so the cost of the
-# export is the difference of two predictions of one and the same machinery.
 
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
@@ -65,11 +55,9 @@ class Difference:
 
 @dataclass(frozen=True)
 class Omission:
-    """One thing that the file cannot hold; `without` is the full model without it.
-
-    `without` is None where its cost cannot be stated, and `note` says why.  `difference` is what
-    leaving it out changes, once that is found.
-    """
+    """One thing that the file cannot hold; `without` is the full model without it, None where its
+    cost cannot be stated, and `note` says why; `difference` is what leaving it out changes, once
+    that is found."""
 
     effect: str
     note: str
@@ -80,41 +68,36 @@ class Omission:
 @dataclass(frozen=True)
 class Kept:
     """`full`: the calibrated arm; `exported`: what the file holds of it; `omissions` between.
-
-    `of_the_measurement`: effects of the instrument, which are no part of the arm; neither model
-    has them.  `fitted`: whether the file's values are no longer those identified."""
+    `of_the_measurement`: effects of the instrument, which neither has."""
 
     full: Valued
     exported: Valued
     conditions: Conditions
     omissions: tuple[Omission, ...]
     of_the_measurement: tuple[str, ...]
-    fitted: bool = False
 
 
-def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
-    """Split the calibrated model into what a rigid or an elastic format holds and the rest.
-
-    Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
-    file has no column of measured torques.
-    """
-    instrument = tuple(name for name in calibrated.effects if CATALOGUE[name].of_the_measurement)
-    unstated = unstated_needs(calibrated, conditions)
-    stated = [name for name, needs in unstated.items() if not needs]
-    full, omissions = arm_with(calibrated, stated), list[Omission]()
+def keep(arm: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
+    """Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
+    file has no column of measured torques."""
+    instrument = tuple(name for name in arm.effects if CATALOGUE[name].of_the_measurement)
+    unstated = calibrated.unstated_needs(arm, conditions)
+    stated = {name for name, needs in unstated.items() if not needs}
+    full, omissions = calibrated.arm_with(arm, stated), list[Omission]()
     format: Format = "elastic" if elastic else "rigid"
+    said = calibrated.RECORDED | {need: option(name) for need, name in OPTIONS.items()}
     for name, needs in unstated.items():
         if needs:
-            missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
+            missing = " and ".join(said[need] for need in needs)
             omissions.append(Omission(name, f"no cost without {missing}", None))
             continue
         # Values that no physical spring or body has stay out, with the reason.
         args = full.values, full.model.chain, full.model.cell
         reason = CATALOGUE[name].unphysical(*args) if elastic else ""
         if reason or format not in CATALOGUE[name].formats:
-            omissions.append(Omission(name, reason, arm_with(calibrated, set(stated) - {name})))
-    lost = {omission.effect for omission in omissions}
-    exported = arm_with(calibrated, set(stated) - lost) if lost & set(stated) else full
+            omissions.append(Omission(name, reason, calibrated.arm_with(arm, stated - {name})))
+    lost = stated & {omission.effect for omission in omissions}
+    exported = calibrated.arm_with(arm, stated - lost) if lost else full
     if elastic:
         exported, changed = _as_springs(exported)
         omissions += [Omission(e, told, _as_springs(full, e)[0]) for e, told in changed]
@@ -147,17 +130,12 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     return Valued(model, np.array([values[name] for name in model.names])), changed
 
 
-# The numbers of an exported model: joint placements, markers, springs, masses.
-#
-# All of them are the expressions of the symbolic arm, evaluated; nothing is derived here a second
-# time.
-
 PAYLOAD = ("load.payload_scale", *(f"load.load_point_{k}" for k in "xyz"))
 
 
 @dataclass(frozen=True)
 class ExportNumbers:
-    """The arm in numbers, in SI units.
+    """The expressions of the symbolic arm, evaluated, in SI units.
 
     `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of the
     joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point` (3,) in
@@ -260,11 +238,8 @@ def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple
 
 
 def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
-    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes.
-
-    Joints beside the chain are held at zero, as when the chain was read.  Empty where the file
-    states no inertia that pinocchio can read.
-    """
+    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes,
+    joints beside the chain at zero; empty where pinocchio reads no inertia in the file."""
     import pinocchio as pin
 
     file, moving = urdf_file(path), {joint.name for joint in chain.joints}
@@ -281,12 +256,10 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
 
 @dataclass(frozen=True)
 class Cost:
-    """`total` between the full model and the file's, `effects` one by one, over `poses`.
-
-    Effects interact, so the total need not be their sum.  `unsettled`: poses without a static
-    equilibrium under the load, left out.  `forces` (L, 3) N act in turn; poses are
-    within the joints' `measured` ranges, else within their limits.
-    """
+    """`total` between the full model and the file's, `effects` one by one, over `poses`.  Effects
+    interact, so the total need not be their sum.  `unsettled`: poses without a static equilibrium
+    under the load, left out.  `forces` (L, 3) N act in turn; poses are within the joints'
+    `measured` ranges, else within their limits."""
 
     total: Difference
     effects: tuple[Omission, ...]
@@ -299,24 +272,20 @@ class Cost:
         return {
             "poses": self.poses,
             "poses_without_equilibrium": self.unsettled,
-            "force_N": self.forces[0].tolist() if len(self.forces) == 1 else None,
-            "forces_N": self.forces.tolist(),
-            "total": self.total.to_json(),
+            "force_N": self.forces[0] if len(self.forces) == 1 else None,
+            "forces_N": self.forces,
+            "total": self.total,
             "effects": [
-                {"effect": e.effect, "note": e.note,
-                 "difference": None if e.difference is None else e.difference.to_json()}
+                {"effect": e.effect, "note": e.note, "difference": e.difference}
                 for e in self.effects
             ],
-        }  # fmt: skip
+        }
 
 
 def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
-    """Differences at `poses` random poses inside the joint limits, under the stated conditions.
-
-    A joint split into compliance levels stands at one of its levels, for which alone the full
-    model is identified.  Raises InsufficientDataError where no pose has an equilibrium.
-    """
-    table = random_table(kept.full.model, kept.conditions, poses, seed)
+    """A joint split into compliance levels stands at one of its levels, for which alone the full
+    model is identified.  Raises InsufficientDataError where no pose has an equilibrium."""
+    table = calibrated.random_table(kept.full.model, kept.conditions, poses, seed)
     # No omission touches the tool, so one set of markers serves every model.
     markers = evaluate_pieces(kept.exported, kept.conditions).points
     full = points_of(kept.full, table, markers)
@@ -481,11 +450,9 @@ def refitted(
     kept: Kept, poses: int, seed: int, correct: bool = False
 ) -> tuple[Kept, Refit | None, JointCorrection]:
     """`kept` with what the file holds fitted at the visits of its conditions, the errors, and with
-    `correct` what joints are to be commanded besides.
-
-    `kept` as it is, and no errors, where no visits are known, or where the file holds all of the
-    arm, or where no geometry was calibrated and no correction is asked for.
-    """
+    `correct` what joints are to be commanded besides; `kept` as it is, and no errors, where no
+    visits are known, or where the file holds all of the arm, or where no geometry was calibrated
+    and no correction is asked for."""
     conditions, part = kept.conditions, kept.exported
     own, visits = part.model.cell.model.effects, conditions.visits
     lacks = any(omission.without is not None for omission in kept.omissions)
@@ -493,10 +460,10 @@ def refitted(
     if visits is None or not lacks or not (geometry or correct):
         return kept, None, JointCorrection()
     rng, model = np.random.default_rng(seed), kept.full.model
-    check = random_table(model, conditions, poses, seed)
-    more = random_table(model, conditions, MORE_OF_CURVES if correct else MORE, seed + 1)
+    check = calibrated.random_table(model, conditions, poses, seed)
+    more = calibrated.random_table(model, conditions, MORE_OF_CURVES if correct else MORE, seed + 1)
     q, force = np.vstack([visits.q, more.q]), np.vstack([visits.force, more.force])
-    table = table_at(model, conditions, q, force, rng)
+    table = calibrated.table_at(model, conditions, q, force, rng)
     others = [choice for choice in own if choice.name not in GEOMETRY]
     whole = _with(part, [*others, *map(EffectChoice, GEOMETRY)])
     start = _gears(kept) if correct else JointCorrection()
@@ -507,7 +474,7 @@ def refitted(
     corrected = _rms(kept, best, check, _commanded(check, curves)) if correct else None
     after = alone if correct else min(before, alone)
     found = Refit(before, after, worst, corrected, poses, len(visits.q))
-    return (replace(kept, exported=best, fitted=True) if after == alone else kept), found, curves
+    return (replace(kept, exported=best) if found.taken else kept), found, curves
 
 
 def _with(part: Valued, effects: Iterable[EffectChoice], tool: Tool | None = None) -> Valued:
@@ -549,7 +516,8 @@ def _gears(kept: Kept) -> JointCorrection:
         x = np.linspace(low, high, int(np.ceil((high - low) / FINE)) + 1)
         q = np.tile(middle, (len(x) + 1, 1))
         q[1:, i] = x
-        table = table_at(part.model, conditions, q, np.zeros(3), np.random.default_rng(0))
+        rng = np.random.default_rng(0)
+        table = calibrated.table_at(part.model, conditions, q, np.zeros(3), rng)
         still = np.zeros(q.shape)  # of no direction, though the joints have moved before
         table = replace(table, approach=still, direction=still + 1e-12, move=still)
         moved = np.broadcast_to(function(*row_inputs(arm, table), part.x)[0][..., 0], q.shape)

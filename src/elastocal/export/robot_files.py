@@ -18,23 +18,13 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
-from elastocal.files import read_bytes
 from elastocal.messages import ElastocalError, InputError, listed, option, require
 from elastocal.model import mjcf
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.mjcf import AXES, SPRING, SPRING_OF_NEW, MjcfArm, import_mujoco, transform
-from elastocal.model.urdf import (
-    MAX_BYTES,
-    TRACKER,
-    Tag,
-    XmlFile,
-    comment,
-    element,
-    tree_of,
-    urdf_file,
-)  # fmt: skip
+from elastocal.model.urdf import TRACKER, Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 
@@ -196,15 +186,14 @@ def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> 
     return f"{head}{as_text(root)}\n"
 
 
-# The user's own file, of either kind, written into another folder: its meshes are found from there.
-
 # Files that MuJoCo looks for beside the main file, whatever directories the compiler states.
 BESIDE = ("include", "model")
 
 
 def moved(path: Path, text: str, folder: Path) -> tuple[str, list[str]]:
-    """The `text` of a file that lies at `path`, to be written into `folder`, and what to know.  A
-    file without names of others, or that stays where it was, is as before to the byte."""
+    """The `text` of a file that lies at `path`, to be written into another `folder`, from where its
+    meshes are to be found, and what to know.  A file without names of others, or that stays where
+    it was, is as before to the byte."""
     xml = XmlFile(path, text.encode("utf-8"), "a file")
     named = [tag for tag in xml.tags if any(_is_file(tag, key) for key in tag.stated)]
     if not named:
@@ -433,7 +422,6 @@ def _compensate(
 #
 # At rest the generalised force r(x) = passive + actuator − bias of all joints x is zero: a root of
 # C r, C the compliances, so that soft and stiff joints are found alike.
-
 TOLERANCE, AT_REST = 1e-13, 1e-10  # rad or m: last step, and what may be left
 
 
@@ -576,12 +564,10 @@ def corrected_mjcf(
 
 
 class _MjcfText(XmlFile):
-    """The text of an MJCF that MuJoCo reads, and what is to be changed in it; `bodies` in MuJoCo's
-    order, the world first."""
+    """`bodies` in MuJoCo's order, the world first."""
 
     def __init__(self, arm: MjcfArm, pieces: ExportNumbers) -> None:
-        path = arm.tree.path
-        super().__init__(path, read_bytes(path, "MuJoCo model", MAX_BYTES), "an MJCF file")
+        super().__init__(arm.tree.path, arm.tree.path.read_bytes(), "an MJCF file")
         self.arm, self.model, self.pieces = arm, arm.model, pieces
         below = self.anywhere("body")
         self.bodies = [*self.anywhere("worldbody")[:1], *below]
@@ -645,7 +631,6 @@ class _MjcfText(XmlFile):
         return len(springs) - len(old)
 
     def lengthen_keys(self, sprung: dict[int, int]) -> None:
-        """Zeros for the new joints in the positions and velocities of keyframes."""
         addresses = {"qpos": self.model.jnt_qposadr, "qvel": self.model.jnt_dofadr}
         for tag in self.anywhere("key", "keyframe") if any(sprung.values()) else ():
             for name in addresses.keys() & tag.stated.keys():

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -42,10 +41,7 @@ def with_joints(
     of [joints] order, else the joint names of the file (columns joint1 …) are brought into the
     order of [joints] names, else of `model_names` where the file has them all."""
     stems = joint_stems(records.numbers)
-    if not stems:
-        return records
-    wrong = [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]
-    if wrong:
+    if wrong := [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]:
         raise InputError(
             f"{records.source}: the mapping fills {listed(stems)}, but not q"
             f"{int(wrong[0][1:]) - 1}; joints are numbered from 1 without gaps"
@@ -552,7 +548,7 @@ LARGEST_FORCE_N = 2e5
 LARGEST_SIGMA_M = 5e-3
 
 
-def plausibility(columns: Columns, table: Measurements, observe: str | None) -> list[str]:
+def plausibility(columns: Columns, table: Measurements, deflections: bool) -> list[str]:
     turning = table.q[:, np.array([kind == "revolute" for kind in table.kinds])]
     turned = float(np.degrees(np.abs(turning).max(initial=0.0)))
     span = float(np.degrees(np.ptp(turning, axis=0).max(initial=0.0)))
@@ -591,7 +587,7 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
           f"standard deviations reach {rounded(sigma * 1e3)} mm; are they in µm?"),),
         ((table.position is not None and bool(np.any(table.force[:, 2] > 0)),
           "some forces point up (+z of the tracker's frame); a hanging load is negative"),),
-        ((observe == "deflection" and lonely,
+        ((deflections and lonely,
           f"{len(lonely)} of {len(labels)} configurations were not measured both "
           f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"),),
     )  # fmt: skip
@@ -642,14 +638,15 @@ def import_files(
     cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
              for values in columns.values()]  # fmt: skip
     text = csv_text(columns, zip(*cells, strict=True))
-    read = partial(read_measurements, f"{name} (not written)", text=text)
+    markers: tuple[str, ...] = ()
+    observe = "position" if any(c.startswith("x_") for c in columns) else "distance"
+    if cell is not None and chain is not None:
+        kinds, markers, observe = chain.kinds, tuple(cell.tool.markers), cell.model.observe
     with _placed(points):  # as the reader of `identify` reads it, and as the cell asks for it
-        if cell is None or chain is None:
-            observe = "position" if any(c.startswith("x_") for c in columns) else "distance"
-            measured = read(joint_kinds=kinds, marker_names=(), observe=observe)
-        else:
-            markers, observe = tuple(cell.tool.markers), cell.model.observe
-            measured = read(joint_kinds=chain.kinds, marker_names=markers, observe=observe)
+        measured = read_measurements(
+            f"{name} (not written)", joint_kinds=kinds, marker_names=markers, observe=observe,
+            text=text,
+        )  # fmt: skip
     fit, refused = None, ""
     if cell is not None and chain is not None:
         if (beyond := beyond_limits(cell, chain, measured.q)) is not None:
@@ -663,7 +660,7 @@ def import_files(
         *told,
         *(() if joined is None else joined.warnings),
         *doubts,
-        *plausibility(columns, measured, None if cell is None else cell.model.observe),
+        *plausibility(columns, measured, cell is not None and observe == "deflection"),
     ]
     warnings += [fit.warning] if fit is not None and fit.warning else []
     return Imported(

@@ -318,10 +318,8 @@ UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are s
 class Records:
     """n rows of exported files; `file` (n,) and `line` (n,) say where each stands.  `numbers` stem
     → (n,) in `units[stem]`, the units of the table to be written; `texts` (name, configuration,
-    marker, repeat, load) → n texts; `load` of all rows, where one is stated.  `understood` says for
-    people what was made of the file, by the keys of the command's JSON: `unused` names of the
-    file's other columns, `ignored` (line, reason) of everything passed over; `doubts`: what to warn
-    of."""
+    marker, repeat, load) → n texts; `load` of all rows, where one is stated; `understood`: the
+    command's JSON, `ignored` in it (line, reason) of all passed over; `doubts`: what to warn of."""
 
     file: list[str]
     line: IntArray
@@ -369,7 +367,7 @@ class Records:
 
     @property
     def q(self) -> Array:
-        """(n, joints) joint values in the units of their columns."""
+        """(n, joints) in the units of their columns."""
         stems = joint_stems(self.numbers)
         return np.column_stack([np.zeros((len(self), 0)), *(self.numbers[s] for s in stems)])
 
@@ -534,10 +532,8 @@ SPHERICAL = ("range", "azimuth", *HEIGHT)
 
 
 def with_positions(records: Records, clockwise: bool = False) -> Records:
-    """The records with x, y, z, where the file has spherical coordinates.
-
-    With range d, azimuth α and zenith angle ζ (π/2 − elevation), in a right-handed frame with z up
-    and x at azimuth zero:
+    """With x, y, z where the file has range d, azimuth α and zenith angle ζ (π/2 − elevation), in a
+    right-handed frame with z up and x at azimuth zero:
 
         x = d sin ζ cos α,   y = d sin ζ sin α,   z = d cos ζ
 
@@ -597,13 +593,13 @@ def with_labels(where: str, records: Records, names: mapping_file.NamesTable) ->
     if "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
     elif names.in_order:
-        n = len(names.in_order)
-        labels["marker"] = [names.in_order[i % n] for i in range(len(records))]
+        times, more = divmod(len(records), len(names.in_order))
+        labels["marker"] = names.in_order * times
         require(
-            len(records) % n == 0,
-            f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
-            f"{listed(names.in_order)} of in_order; a point is missing or one too many: name the "
-            "points",
+            not more,
+            f"{records.source}: {len(records)} points, which is no multiple of the "
+            f"{len(names.in_order)} markers {listed(names.in_order)} of in_order; a point is "
+            "missing or one too many: name the points",
         )
     for stem, texts in labels.items():
         for i, text in enumerate(texts):

@@ -28,7 +28,7 @@ from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometr
 from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import highest_origins, reach_of, suitable_load
+from elastocal.model.rigid import drawn_joints, highest_origins, reach_of, suitable_load
 from elastocal.model.urdf import TRACKER, Tree, XmlFile, check_urdf, is_called, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
@@ -143,6 +143,7 @@ def first_cell(robot: Robot, folder: Path) -> str:
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
     arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None
+    tree = None if kind == "dh" else check_urdf(path) if arm is None else arm.tree
     reach = max(reach_of(chain), 0.05)
     if clashing(chain) and robot.joint_names is None:
         robot = replace(robot, joint_names="order")
@@ -155,7 +156,9 @@ def first_cell(robot: Robot, folder: Path) -> str:
         "",
         *_robot(robot, kind, path, folder),
         *_joints(chain),
-        REST.format(**_guesses(chain, reach, *_mount(robot, arm)), **_tool(robot, reach, arm)),
+        REST.format(
+            **_guesses(chain, reach, *_mount(robot, tree, arm)), **_tool(robot, reach, tree)
+        ),
     ]
     return "\n".join(lines)
 
@@ -209,14 +212,13 @@ def placeholder_masses(chain: Chain) -> str:
     )
 
 
-def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
+def _mount(robot: Robot, tree: Tree | None, arm: MjcfArm | None) -> tuple[Array, str]:
     """T (4, 4) of the base in a frame whose z is up, as the file has it, and who says so."""
     if arm is not None:
         up, told = arm.upright()
         return pose_at(np.zeros(3), up) @ arm.tree.placed(arm.base), told
-    if robot.urdf is None:
+    if tree is None:
         return np.eye(4), "guess: the base stands upright"
-    tree = check_urdf(robot.urdf)
     base = tree.root if robot.base is None else robot.base
     T, told = tree.placed(base), f"of '{base}' in the file's '{tree.root}', z up"
     return (T if tree.root in WORLDS else pose_at(np.zeros(3), T[:3, :3])), told
@@ -240,27 +242,18 @@ def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
 
 def _joints(chain: Chain) -> Iterator[str]:
     yield f"[limits]                               # of {chain.n_joints} joints, in their order"
-    for i, joint in enumerate(chain.joints, 1):
-        turns, low, high = joint.kind == "revolute", joint.lower, joint.upper
-        unit, scale, whole = ("deg", math.degrees(1.0), 2 * math.pi) if turns else ("mm", 1e3, 1.0)
+    low, high, _ = drawn_joints(chain)
+    for i, (joint, ends) in enumerate(zip(chain.joints, zip(low, high, strict=True), strict=True)):
+        unit, scale = ("deg", math.degrees(1.0)) if joint.kind == "revolute" else ("mm", 1e3)
         told = f"{printable(joint.name)}, {joint.kind}"
-        if not (math.isfinite(low) and math.isfinite(high)):
-            told += "; the file has no limit: guess"
-            start = high - whole if math.isfinite(high) else -whole / 2
-            low = low if math.isfinite(low) else start
-            high = high if math.isfinite(high) else low + whole
-        ends = ", ".join(f"{value * scale:.6g}" for value in (low, high))
-        yield f"joint{i}_{unit} = [{ends}]".ljust(38) + f" # {told}"
+        told += "; the file has no limit: guess" * (ends != (joint.lower, joint.upper))
+        values = ", ".join(f"{value * scale:.6g}" for value in ends)
+        yield f"joint{i + 1}_{unit} = [{values}]".ljust(38) + f" # {told}"
     yield ""
 
 
-def _tool(robot: Robot, reach: float, arm: MjcfArm | None) -> dict[str, str]:
-    there: dict[str, Array] = {}
-    if arm is not None:
-        there = arm.tree.places(arm.base, arm.flange)
-    elif robot.urdf is not None:
-        tree = check_urdf(robot.urdf)
-        there = tree.places(*tree.ends(robot.base, robot.flange))
+def _tool(robot: Robot, reach: float, tree: Tree | None) -> dict[str, str]:
+    there = {} if tree is None else tree.places(*tree.ends(robot.base, robot.flange))
     usable = {n: p for n, p in there.items() if n == n.strip() == printable(n)}
     told, side, digits = "the model's sites; keep the reflectors", reach / 12, 4
     # Off the last joint's axis, which a load on it would not turn.

@@ -23,15 +23,7 @@ from pydantic import Field
 from elastocal import config, messages
 from elastocal.config import NonNegative, Positive, Table, Text, Vector3, checked, key, place
 from elastocal.measurements import families
-from elastocal.messages import (
-    NUMBER,
-    InputError,
-    did_you_mean,
-    listed,
-    option,
-    quoted,
-    require,
-)
+from elastocal.messages import NUMBER, InputError, did_you_mean, listed, option, quoted, require
 from elastocal.tables import THOUSANDS, column, first_bad_cell
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
@@ -212,19 +204,13 @@ def _of_any_joint(name: str) -> str:
     return _NUMBERED.sub(r"\1#", name)
 
 
-def _quantities() -> dict[str, tuple[str, ...]]:
-    found: dict[str, tuple[str, ...]] = {"range": ("length",)}
-    found |= dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
-    for kind in ("revolute", "prismatic"):
-        for family in families((kind,)).values():
-            for stem, units in family.units.items():
-                if (name := _of_any_joint(stem)) not in TEXTS:
-                    known = found.get(name, ())
-                    found[name] = tuple(dict.fromkeys((*known, *quantities(units[0]))))
-    return found
-
-
-_QUANTITIES = _quantities()
+_QUANTITIES: dict[str, tuple[str, ...]] = {"range": ("length",)}
+_QUANTITIES |= dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
+for _family in (*families(("revolute",)).values(), *families(("prismatic",)).values()):
+    for _stem, (_unit, *_) in _family.units.items():
+        if (_name := _of_any_joint(_stem)) not in TEXTS:
+            _known = (*_QUANTITIES.get(_name, ()), *quantities(_unit))
+            _QUANTITIES[_name] = tuple(dict.fromkeys(_known))
 
 
 @dataclass(frozen=True)

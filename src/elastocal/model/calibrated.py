@@ -543,8 +543,8 @@ class CalibratedTool:
         y = ca.vertcat(position, rigid.ARM_LENGTH * tilt)
         self._placing = Total(self._symbolic, position, q)
         self._turning = Total(self._symbolic, y, q, (turned,))
-        inputs, frames = [*own.inputs.values(), p], [own.T_tracker_base, place, turn]
-        self._frames = BatchFunction(inputs, frames, self._symbolic.backend)
+        frames = [own.T_tracker_base, rigid.transform(turn, place)]
+        self._frames = BatchFunction([*own.inputs.values(), p], frames, self._symbolic.backend)
 
     def rows(self, table: Measurements) -> list[NDArray]:
         """What the model asks of the table's rows, one array per input; joints are put in later."""
@@ -596,13 +596,12 @@ class CalibratedTool:
         r[:, :3] -= position
         return r, slope
 
-    def frames(self, rows: list[NDArray]) -> tuple[Array, Array, Array]:
-        """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for;
-        the point (n, 3) m and the tool's rotation (n, 3, 3) in the flange frame.  What moves them
-        with the joints' angles is an error of the arm and no part of the frames."""
+    def frames(self, rows: list[NDArray]) -> list[Array]:
+        """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for, and
+        T_flange_tool (n, 4, 4).  What moves them with the joints' angles is an error of the arm and
+        no part of the frames."""
         x = self.x.copy()
         for group in smooth_groups(self.calibrated.model):
             if group.basis is not None and group.lasting:
                 x[group.columns] = 0.0
-        T, place, turn = self._frames(*rows, x)
-        return T, place[..., 0], turn
+        return self._frames(*rows, x)

@@ -254,6 +254,8 @@ FORMATS = {
 
 
 def export_blocks(done: Exported) -> Iterator[say.Block]:
+    from elastocal.export.export import base_told
+
     def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
         return "< 0.001 µm" if metres < 1e-9 else say.length(metres)
 
@@ -287,7 +289,7 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         yield say.Sentence(f"{how}: {told}.")
         if refit.taken:
             there = ", which the file has" if done.framed else ": place it there"
-            yield say.Sentence(f"The file is fitted {done.base_told}{there}.")
+            yield say.Sentence(f"The file is fitted {base_told(done.T_tracker_base)}{there}.")
     if done.checked is not None:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
