@@ -191,7 +191,7 @@ def design_request(
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.poses import read_pins, shares_of
 
-    cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
+    cell = model.cell if isinstance(model, Model) else cell_of(model)
     search = {name: asked.pop(name) for name in ("effort", "seed", "jobs") if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
@@ -207,7 +207,7 @@ def design_request(
     known = None if all(file is None for file in files) else Model(cell)
     if augment is not None and known is not None:
         own = model if isinstance(model, Model) else known
-        done = measurements_of(own, "augment", augment)
+        done = measurements_of(own, augment)
         known = own.with_markers_of(done)
         cell = cell if own is known else replace(cell, tool=known.cell.tool)
     stated, notes = (None, ()) if known is None else _prior_of(knowledge, known)
@@ -481,8 +481,8 @@ def identify(
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = measurements_of(made, "data", data)
-    kept_back = None if test is None else measurements_of(made, "test", test)
+    table = measurements_of(made, data)
+    kept_back = None if test is None else measurements_of(made, test)
     made = made.with_markers_of(*(t for t in (table, kept_back) if t is not None))
     prior = _gaussian(prior)
     if known is not None:
@@ -553,7 +553,7 @@ def diagnose(
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = measurements_of(made, "data", data)
+    table = measurements_of(made, data)
     made = made.with_markers_of(table)
     found = run(made, table, options, tell)
     if extra_poses is None or not found.open:
@@ -613,10 +613,10 @@ def compensate(
     import numpy as np
 
     from elastocal.compensation import compensate as run
-    from elastocal.model.calibrated import given_arm, tool_point
+    from elastocal.model.calibrated import CalibratedArm, tool_point
     from elastocal.model.effects.base import given_force
 
-    arm = given_arm("arm", arm)
+    arm = arm if isinstance(arm, CalibratedArm) else arm.arm
     force = given_force(load)
     check_frame(frame)
     chain = arm.model.chain
@@ -674,7 +674,8 @@ def _targets(
     return targets_at("targets", found, None, frame, force)
 
 
-def effects(cell: Any = None) -> DataFrame:
+@checked_arguments
+def effects(cell: AnyModel | None = None) -> DataFrame:
     """The physical effects that can be fitted.
 
     Args:
@@ -695,11 +696,11 @@ def effects(cell: Any = None) -> DataFrame:
     """
     import pandas as pd
 
-    from elastocal.model.manipulator import effect_entries
+    from elastocal.model.manipulator import Model, effect_entries
     from elastocal.simulation import DEMO
 
     given = DEMO / "cell.toml" if cell is None else cell
-    return pd.DataFrame(effect_entries(_checked_cell(getattr(given, "cell", given), "cell")))
+    return pd.DataFrame(effect_entries(given.cell if isinstance(given, Model) else given))
 
 
 def _silent(message: str) -> None:
@@ -709,14 +710,7 @@ def _silent(message: str) -> None:
 def _model(given: AnyModel) -> Model:
     from elastocal.model.manipulator import Model
 
-    return given if isinstance(given, Model) else Model(_checked_cell(given))
-
-
-def _checked_cell(given: Any, name: str = "model") -> Cell | str | Path:
-    if isinstance(given, str | Path) or type(given).__name__ == "Cell":
-        return given
-    told = "takes a Model, a Cell or the path of a cell file"
-    raise InputError(f"{option(name)} {told}; found {type(given).__name__}")
+    return given if isinstance(given, Model) else Model(given)
 
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
@@ -733,9 +727,6 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
 
     if prior is None or isinstance(prior, GaussianPrior):
         return prior
-    told = 'takes mean and std by parameter, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}'
-    named = isinstance(prior, Mapping) and all(isinstance(v, Mapping) for v in prior.values())
-    require(named, f"{option('prior')} {told}; found {shown(prior)}")
     return GaussianPrior.from_dict(prior)
 
 

@@ -236,14 +236,6 @@ class CalibratedArm(Valued, Saved):
         return self.model.pose(q, self.x, load)
 
 
-def given_arm(name: str, given: Any) -> CalibratedArm:
-    arm = getattr(given, "arm", given)
-    if not isinstance(arm, CalibratedArm):
-        told = "takes a calibrated arm, as fit.arm or what read_calibrated gives; found"
-        raise InputError(f"{option(name)} {told} {type(arm).__name__}")
-    return arm
-
-
 def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
     """The arm without smooth functions of the time, which are of one campaign, and their names."""
     model = arm.model
