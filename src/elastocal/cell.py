@@ -7,10 +7,9 @@ in SI units.  Either way it is checked once and then frozen.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import field
 from datetime import date
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -317,9 +316,6 @@ class Acceptance:
     test: Positive | None = optional("test_um")
 
 
-ENTRY = partial(optional, form=Text)
-
-
 @record
 class CertificateEntries:
     """What a calibration certificate states besides the results (ISO/IEC 17025, 7.8.2).
@@ -329,20 +325,20 @@ class CertificateEntries:
     `limit` m: the largest position error with which the arm conforms; None for no such statement.
     """
 
-    number: str | None = ENTRY()
-    laboratory: str | None = ENTRY()
+    number: Text | None = optional()
+    laboratory: Text | None = optional()
     country: Country | None = optional(takes='the two letters of ISO 3166, as in "DE"')
-    customer: str | None = ENTRY()
-    robot_serial: str | None = ENTRY()
-    tool_serial: str | None = ENTRY()
-    instrument: str | None = ENTRY()
-    instrument_calibration: str | None = ENTRY()
-    place: str | None = ENTRY()
+    customer: Text | None = optional()
+    robot_serial: Text | None = optional()
+    tool_serial: Text | None = optional()
+    instrument: Text | None = optional()
+    instrument_calibration: Text | None = optional()
+    place: Text | None = optional()
     measured_on: Annotated[str, holding(date.fromisoformat)] | None = optional(
         takes='the date of measurement, as in "2026-03-17"'
     )
-    operator: str | None = ENTRY()
-    procedure: str | None = ENTRY()
+    operator: Text | None = optional()
+    procedure: Text | None = optional()
     temperature: float | None = optional("temperature_c", takes="a number in °C")
     instrument_uncertainty: NonNegative | None = optional("instrument_uncertainty_um")
     limit: Positive | None = optional("limit_um")
@@ -434,19 +430,21 @@ class Cell:
         """Raises InputError where the parts of the cell do not fit together, which `replace` may
         leave, or `model.effects` names none of the `known_effects`; None leaves these unchecked."""
         where, sight = self.source, self.workspace.visibility
-        normals = f"{where}: [workspace.visibility.normals]"
-        self._check_markers(normals, sight.normals if sight else ())
+        freedom = self.design.choose
+        for table, names in (
+            (f"{where}: [workspace.visibility.normals]", sight.normals if sight else ()),
+            (wish("marker_sigma", f"{where}: [design.marker_sigma_um]"), self.design.marker_sigma),
+            (f"{where}: [design.choose.markers_m]", freedom.markers if freedom else ()),
+        ):
+            for name in names:
+                told = f"{table} names {quoted(name)}, which is no marker of the cell"
+                check_known(name, self.tool.markers, told, "[tool.markers_m] has")
         least = None if sight is None else sight.min_markers
         require(
             least is None or least <= len(self.tool.markers),
             f"{where}: key workspace.visibility.min_markers is {least}, but [tool.markers_m] has "
             f"{listed(self.tool.markers) or 'none'}; ask for fewer",
         )
-        sigmas = wish("marker_sigma", f"{where}: [design.marker_sigma_um]")
-        self._check_markers(sigmas, self.design.marker_sigma)
-        freedom = self.design.choose
-        chosen = f"{where}: [design.choose.markers_m]"
-        self._check_markers(chosen, freedom.markers if freedom else ())
         require(
             not self.workspace.urdf_geometry or self.robot.urdf is not None,
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
@@ -457,11 +455,6 @@ class Cell:
                 told = f"{where}: key model.effects[{i}] names the unknown effect"
                 told = f"{told} {quoted(choice.name)}"
                 check_known(choice.name, tuple(known_effects), told, "known effects:")
-
-    def _check_markers(self, table: str, names: Iterable[str]) -> None:
-        for name in names:
-            told = f"{table} names {quoted(name)}, which is no marker of the cell"
-            check_known(name, self.tool.markers, told, "[tool.markers_m] has")
 
 
 read_cell = Cell.read

@@ -219,7 +219,7 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins, asked=named,
+        **search, fixed=_names(fixed), done=done, notes=notes, pins=pins, asked=named,
         prior=_gaussian(prior) if stated is None else stated, curve=tuple(sorted({*curve})),
     )  # fmt: skip
     return cell, options
@@ -239,7 +239,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
     made: dict[str, Callable[[Any], Any]] = {
         "criterion": lambda name: criterion_named(name, option("criterion")) and name,
-        "interest": lambda names: _names("interest", names),
+        "interest": _names,
         "loads": lambda forces: np.atleast_2d(np.asarray(forces, dtype=float)),
         "test_poses": test_poses,
         "test_path": lambda at: wish.TargetPath(Path(at)) if isinstance(at, str | Path) else at,
@@ -475,7 +475,7 @@ def identify(
     matrix = None if covariance is None else np.asarray(covariance, dtype=float)
     options = Options(
         method=method, noise=noise, weights=weights, covariance=matrix, intervals=intervals,
-        fixed=_names("fixed", fixed), faulty=outliers, seed=cast(int, seed),
+        fixed=_names(fixed), faulty=outliers, seed=cast(int, seed),
     )  # fmt: skip
     known = knowledge_of(knowledge, physical or bounded)
     tell = progress or _silent
@@ -547,7 +547,7 @@ def diagnose(
     from elastocal.diagnosis.diagnose import diagnose as run
     from elastocal.model.manipulator import measurements_of
 
-    options = DiagnosisOptions(cast(int, seed), _names("without", without), false_alarm)
+    options = DiagnosisOptions(cast(int, seed), _names(without), false_alarm)
     if extra_poses is not None:
         whole("extra_poses", extra_poses, 1)
     tell = progress or _silent
@@ -730,5 +730,5 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
     return GaussianPrior.from_dict(prior)
 
 
-def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
+def _names(given: str | Sequence[str]) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(given)

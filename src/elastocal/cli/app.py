@@ -42,12 +42,10 @@ from typer.core import TyperGroup
 
 from elastocal import __version__
 from elastocal.above import LARGEST_SEED, kinds_of
-from elastocal.files import check_output, is_plugin_file, together
+from elastocal.files import TRACEBACK, check_output, explained, is_plugin_file, together
 from elastocal.messages import (
-    TRACEBACK,
     ElastocalError,
     InputError,
-    explained,
     flag_of,
     json_text,
     require,
