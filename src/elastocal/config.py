@@ -327,7 +327,9 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     return from_table(cls, found, spot)
 
 
-_adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}  # by what is kept beside them
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind, config=STRICT)
 
 
 def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any:
@@ -346,9 +348,7 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
     keys, problem = spot.keys, ""
     if not is_table(members[0]):
         try:
-            if id(kind) not in _adapters:
-                _adapters[id(kind)] = kind, TypeAdapter(kind, config=STRICT)
-            return _adapters[id(kind)][1].validate_python(found)
+            return _adapter(kind).validate_python(found)
         except ValidationError as error:
             first = error.errors(include_url=False, include_context=False)[0]
             problem, path = first["type"], first["loc"]

@@ -37,22 +37,17 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 else:
     globals().update(later(
+        "elastocal CalibratedArm Calibration Cell Compensation Diagnosis Knowledge Measurements",
+        "elastocal Model Plan",
+        "elastocal.cell_tables Freedom Motion TargetBox TargetPath TargetPose",
+        "elastocal.compensation Targets",
+        "elastocal.identification.knowledge Constraints GaussianPrior",
+        "elastocal.identification.start FaultyReadings IntervalKind Method",
+        "elastocal.identification.weighted_problem WeightKind",
+        "elastocal.planning.design Effort",
+        "numpy.random Generator",
         "numpy.typing ArrayLike",
         "pandas DataFrame",
-        "elastocal.cell_tables Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.cell Cell",
-        "elastocal.compensation Compensation Targets",
-        "elastocal.diagnosis.diagnosis Diagnosis",
-        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
-        "elastocal.identification.start FaultyReadings IntervalKind Method",
-        "elastocal.identification.result Calibration",
-        "elastocal.identification.weighted_problem WeightKind",
-        "elastocal.measurements Measurements",
-        "elastocal.model.calibrated CalibratedArm",
-        "elastocal.model.manipulator Model",
-        "elastocal.planning.design Effort",
-        "elastocal.planning.plan Plan",
-        "numpy.random Generator",
     ))  # fmt: skip
 
 # Each verb imports what it calls: one should not load another, and --help none of them.
