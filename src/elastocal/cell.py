@@ -29,6 +29,7 @@ from elastocal.config import (
     Numbers,
     Positive,
     Positives,
+    Record,
     Spot,
     Table,
     Text,
@@ -47,7 +48,6 @@ from elastocal.config import (
     numbers,
     optional,
     read_toml,
-    record,
     several,
     stated,
 )
@@ -88,8 +88,7 @@ NAME = 'a name of its own, e.g. "table", on one line without blanks at its ends'
 PARTS = re.compile(r"base|flange|load|rope|link[0-9]+")
 
 
-@record
-class Solid:
+class Solid(Record):
     """A rigid shape at `placement` (4, 4) in its carrier's frame.
 
     `size` in m: box (3,) edge lengths; sphere (1,) radius; cylinder (2,) radius and length along
@@ -129,8 +128,7 @@ class Solid:
         return {"size": size, "placement": pose_at(table.get("position_m", (0, 0, 0)), turned)}
 
 
-@record
-class CarriedBody:
+class CarriedBody(Record):
     """A solid fixed to `on`: "base", "link1" … "linkN" (moved by joint N) or "flange"."""
 
     solid: Solid = keyed(keys=keys_of(Solid))
@@ -143,8 +141,7 @@ class CarriedBody:
         return {"solid": from_table(Solid, table, spot)}
 
 
-@record
-class HalfSpace:
+class HalfSpace(Record):
     """Nothing may be where normal · (x − point) < 0; `normal` (3,) is a unit vector."""
 
     name: str = keyed(takes=NAME, form=Label)
@@ -152,8 +149,7 @@ class HalfSpace:
     normal: Direction = keyed(note=", a direction to the side where the arm may be")
 
 
-@record
-class HangingLoad:
+class HangingLoad(Record):
     """What hangs at the load point by a rope, straight down, in loaded readings only.
 
     `solid` is upright, the rope's lower end at its top; `rope` its length in m.  `rope_axis` (3,)
@@ -179,8 +175,7 @@ class HangingLoad:
         return {"solid": from_table(Solid, table, spot, name="load")}
 
 
-@record
-class Visibility:
+class Visibility(Record):
     """What the tracker must see: all markers, or `min_markers` of them, past arm and obstacles.
 
     `normals` name → (3,) axis of the reflector in the flange frame, `max_incidence` rad from it;
@@ -212,8 +207,7 @@ class Visibility:
         )
 
 
-@record
-class Workspace:
+class Workspace(Record):
     """`link_radius` (n,) m: capsules along the links, (1,) where all are alike, () for none;
     `urdf_geometry`: the URDF's own collision shapes.  `clearance` m to obstacles,
     `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
@@ -302,8 +296,7 @@ def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
     return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
 
 
-@record
-class Acceptance:
+class Acceptance(Record):
     """What a calibration must keep to be accepted: 3-D rms errors in m, None for any.
 
     `heldout`: in poses left out of the fit, the noise of a reading included; `new_poses`: the
@@ -316,8 +309,7 @@ class Acceptance:
     test: Positive | None = optional("test_um")
 
 
-@record
-class CertificateEntries:
+class CertificateEntries(Record):
     """What a calibration certificate states besides the results (ISO/IEC 17025, 7.8.2).
 
     `country` by two letters (ISO 3166).  `temperature` in °C.  `instrument_uncertainty` m: expanded
@@ -350,8 +342,7 @@ class CertificateEntries:
         return [k[0].name for n, k in keys if n != "limit" and getattr(self, n) is None]
 
 
-@record
-class Cell:
+class Cell(Record):
     """Everything known about arm, tool, tracker and model before measuring.
 
     `limits` joint → (lower, upper) in rad or m, which narrow those of the robot.  `plugins`:

@@ -648,10 +648,7 @@ def _targets(
         return targets
     if isinstance(targets, str | Path):
         return read_targets(targets, kinds, frame, force)
-    try:
-        found = np.asarray(targets, dtype=float)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
+    found = np.asarray(targets, dtype=float)
     if found.shape in ((3,), (4, 4)):
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
@@ -659,7 +656,6 @@ def _targets(
     right = placed and len(found) > 0
     told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found"
     require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
-    require(bool(np.isfinite(found).all()), f"{option('targets')} {told} NaN or infinity")
     if oriented:
         R, last = found[:, :3, :3], found[:, 3] - [0, 0, 0, 1]
         off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() + np.abs(last).max()
