@@ -223,12 +223,12 @@ def _array(value: Any) -> bool:
     return numbers.dtype.kind in "iuf" and bool((np.abs(numbers) <= LARGEST).all())
 
 
-def _values(value: Any) -> bool:
+def _values(value: Any, kinds: str = "iufc") -> bool:
     """Numbers, complex ones too; what computes with them says whether it can."""
     import numpy as np
 
     try:
-        return np.asarray(value).dtype.kind in "iufc"
+        return np.asarray(value).dtype.kind in kinds
     except ValueError:  # rows of different length
         return False
 
@@ -284,20 +284,24 @@ KINDS: dict[str, tuple[str, Check]] = {
     "Array": ("numbers", _values),
     "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
     "Sequence[str]": ("a list of names", _list_of(lambda v: isinstance(v, str))),
+    "Sequence[int | str | Path]": ("a list of them", _list_of(lambda v: True)),
     "Sequence[TargetPose]": ("a list of TargetPose", _list_of(_is_a("TargetPose"))),
     "Mapping[str, float]": ("numbers by name", _by_name(_number)),
     "Mapping[str, Sequence[float]]": ("a list of numbers by name", _by_name(_list_of(_number, 1))),
-    "Mapping": ("a Mapping", lambda v: isinstance(v, Mapping)),
+    "Mapping[str, Mapping[str, float]]": (
+        'mean and std by parameter, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}',
+        _by_name(_by_name(_number)),
+    ),
+    "Measurements": ("measurements (Model.read, Model.table)", _is_a("Measurements")),
     "tuple[ArrayLike, ArrayLike]": ("two corners", _list_of(_array, 2, 2)),
     "Progress": ("a function", callable),
     "None": ("None", lambda v: v is None),
     "Any": ("anything", lambda v: True),
 }  # fmt: skip
-CLASSES = ("Path", "Mapping")  # like those that KINDS does not name
 ALIASES = {
     "AnyModel": "Model | Cell | str | Path",
     "Table": "Measurements | str | Path | DataFrame",
-    "Prior": "Mapping | GaussianPrior",
+    "Prior": "Mapping[str, Mapping[str, float]] | GaussianPrior",
     "Seed": "int",
     **dict.fromkeys(
         ("Effort", "Method", "WeightKind", "IntervalKind", "FaultyReadings", "Convention"), "str"
@@ -305,10 +309,12 @@ ALIASES = {
 }
 # A load is the argument `load`, and in a table its column `force`; each is taken for the other.
 SAME = {"force": "load", "load": "force"}
-SEED = (
-    f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator",
-    lambda v: (_whole(v) and 0 <= v <= LARGEST_SEED) or _is_a("Generator")(v),
-)
+# Arguments that are the same wherever they stand; whether a load is one its function says.
+BY_NAME: dict[str, list[tuple[str, Check]]] = {
+    "seed": [(f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator",
+              lambda v: (_whole(v) and 0 <= v <= LARGEST_SEED) or _is_a("Generator")(v))],
+    "load": [("finite numbers", lambda v: v is None or _values(v, "iuf"))],
+}  # fmt: skip
 
 
 def checked_arguments(function: F) -> F:
@@ -317,29 +323,13 @@ def checked_arguments(function: F) -> F:
     In place of a `seed` it takes a numpy Generator, of which one is drawn, and what SAME says.
     """
     signature = inspect.signature(function)
-    named = {
-        name: kinds_of(given.annotation)
-        for name, given in signature.parameters.items()
-        if isinstance(given.annotation, str) and name != "self"
-    }
     kinds = {
-        name: [SEED] if name == "seed" else [KINDS.get(k, (f"a {k}", _is_a(k))) for k in own]
-        for name, own in named.items()
+        name: [KINDS.get(kind, (f"a {kind}", _is_a(kind))) for kind in kinds_of(given.annotation)]
+        for name, given in signature.parameters.items()
+        if isinstance(given.annotation, str)
     }
+    kinds |= {name: BY_NAME[name] for name in kinds if name in BY_NAME}
     renamed = {o: n for o, n in SAME.items() if n in kinds and o not in kinds}
-
-    def check(given: Mapping[str, Any], names: Collection[str]) -> None:
-        for name in names:
-            if name in given and not any(fits(given[name]) for _, fits in kinds[name]):
-                takes = " or ".join(dict.fromkeys(words for words, _ in kinds[name]))
-                raise InputError(f"{option(name)} takes {takes}; found {shown(given[name])}")
-
-    # What may be one of several classes the function tells apart itself, and says it better.
-    simple = [
-        name
-        for name, own in named.items()
-        if name != "load" and sum(k in CLASSES or k not in KINDS for k in own) < 2
-    ]
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
@@ -356,14 +346,13 @@ def checked_arguments(function: F) -> F:
             near = did_you_mean(unknown[0], signature.parameters) if unknown else ""
             raise TypeError(f"{function.__qualname__}() {error}{near}") from None
         given = bound.arguments
-        check(given, simple)
+        for name, known in kinds.items():
+            if name in given and not any(fits(given[name]) for _, fits in known):
+                takes = " or ".join(dict.fromkeys(words for words, _ in known))
+                raise InputError(f"{option(name)} takes {takes}; found {shown(given[name])}")
         if hasattr(given.get("seed"), "integers"):
             given["seed"] = int(given["seed"].integers(LARGEST_SEED))
-        try:
-            return sealed(function(*bound.args, **bound.kwargs))
-        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError):
-            check(given, kinds)
-            raise
+        return sealed(function(*bound.args, **bound.kwargs))
 
     return run  # type: ignore[return-value]
 

@@ -7,10 +7,9 @@ in SI units.  Either way it is checked once and then frozen.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import field
 from datetime import date
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,6 +29,7 @@ from elastocal.config import (
     Numbers,
     Positive,
     Positives,
+    Record,
     Spot,
     Table,
     Text,
@@ -48,7 +48,6 @@ from elastocal.config import (
     numbers,
     optional,
     read_toml,
-    record,
     several,
     stated,
 )
@@ -89,8 +88,7 @@ NAME = 'a name of its own, e.g. "table", on one line without blanks at its ends'
 PARTS = re.compile(r"base|flange|load|rope|link[0-9]+")
 
 
-@record
-class Solid:
+class Solid(Record):
     """A rigid shape at `placement` (4, 4) in its carrier's frame.
 
     `size` in m: box (3,) edge lengths; sphere (1,) radius; cylinder (2,) radius and length along
@@ -130,8 +128,7 @@ class Solid:
         return {"size": size, "placement": pose_at(table.get("position_m", (0, 0, 0)), turned)}
 
 
-@record
-class CarriedBody:
+class CarriedBody(Record):
     """A solid fixed to `on`: "base", "link1" … "linkN" (moved by joint N) or "flange"."""
 
     solid: Solid = keyed(keys=keys_of(Solid))
@@ -144,8 +141,7 @@ class CarriedBody:
         return {"solid": from_table(Solid, table, spot)}
 
 
-@record
-class HalfSpace:
+class HalfSpace(Record):
     """Nothing may be where normal · (x − point) < 0; `normal` (3,) is a unit vector."""
 
     name: str = keyed(takes=NAME, form=Label)
@@ -153,8 +149,7 @@ class HalfSpace:
     normal: Direction = keyed(note=", a direction to the side where the arm may be")
 
 
-@record
-class HangingLoad:
+class HangingLoad(Record):
     """What hangs at the load point by a rope, straight down, in loaded readings only.
 
     `solid` is upright, the rope's lower end at its top; `rope` its length in m.  `rope_axis` (3,)
@@ -180,8 +175,7 @@ class HangingLoad:
         return {"solid": from_table(Solid, table, spot, name="load")}
 
 
-@record
-class Visibility:
+class Visibility(Record):
     """What the tracker must see: all markers, or `min_markers` of them, past arm and obstacles.
 
     `normals` name → (3,) axis of the reflector in the flange frame, `max_incidence` rad from it;
@@ -213,8 +207,7 @@ class Visibility:
         )
 
 
-@record
-class Workspace:
+class Workspace(Record):
     """`link_radius` (n,) m: capsules along the links, (1,) where all are alike, () for none;
     `urdf_geometry`: the URDF's own collision shapes.  `clearance` m to obstacles,
     `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
@@ -303,8 +296,7 @@ def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
     return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
 
 
-@record
-class Acceptance:
+class Acceptance(Record):
     """What a calibration must keep to be accepted: 3-D rms errors in m, None for any.
 
     `heldout`: in poses left out of the fit, the noise of a reading included; `new_poses`: the
@@ -317,11 +309,7 @@ class Acceptance:
     test: Positive | None = optional("test_um")
 
 
-ENTRY = partial(optional, form=Text)
-
-
-@record
-class CertificateEntries:
+class CertificateEntries(Record):
     """What a calibration certificate states besides the results (ISO/IEC 17025, 7.8.2).
 
     `country` by two letters (ISO 3166).  `temperature` in °C.  `instrument_uncertainty` m: expanded
@@ -329,20 +317,20 @@ class CertificateEntries:
     `limit` m: the largest position error with which the arm conforms; None for no such statement.
     """
 
-    number: str | None = ENTRY()
-    laboratory: str | None = ENTRY()
+    number: Text | None = optional()
+    laboratory: Text | None = optional()
     country: Country | None = optional(takes='the two letters of ISO 3166, as in "DE"')
-    customer: str | None = ENTRY()
-    robot_serial: str | None = ENTRY()
-    tool_serial: str | None = ENTRY()
-    instrument: str | None = ENTRY()
-    instrument_calibration: str | None = ENTRY()
-    place: str | None = ENTRY()
+    customer: Text | None = optional()
+    robot_serial: Text | None = optional()
+    tool_serial: Text | None = optional()
+    instrument: Text | None = optional()
+    instrument_calibration: Text | None = optional()
+    place: Text | None = optional()
     measured_on: Annotated[str, holding(date.fromisoformat)] | None = optional(
         takes='the date of measurement, as in "2026-03-17"'
     )
-    operator: str | None = ENTRY()
-    procedure: str | None = ENTRY()
+    operator: Text | None = optional()
+    procedure: Text | None = optional()
     temperature: float | None = optional("temperature_c", takes="a number in °C")
     instrument_uncertainty: NonNegative | None = optional("instrument_uncertainty_um")
     limit: Positive | None = optional("limit_um")
@@ -354,8 +342,7 @@ class CertificateEntries:
         return [k[0].name for n, k in keys if n != "limit" and getattr(self, n) is None]
 
 
-@record
-class Cell:
+class Cell(Record):
     """Everything known about arm, tool, tracker and model before measuring.
 
     `limits` joint → (lower, upper) in rad or m, which narrow those of the robot.  `plugins`:
@@ -434,19 +421,21 @@ class Cell:
         """Raises InputError where the parts of the cell do not fit together, which `replace` may
         leave, or `model.effects` names none of the `known_effects`; None leaves these unchecked."""
         where, sight = self.source, self.workspace.visibility
-        normals = f"{where}: [workspace.visibility.normals]"
-        self._check_markers(normals, sight.normals if sight else ())
+        freedom = self.design.choose
+        for table, names in (
+            (f"{where}: [workspace.visibility.normals]", sight.normals if sight else ()),
+            (wish("marker_sigma", f"{where}: [design.marker_sigma_um]"), self.design.marker_sigma),
+            (f"{where}: [design.choose.markers_m]", freedom.markers if freedom else ()),
+        ):
+            for name in names:
+                told = f"{table} names {quoted(name)}, which is no marker of the cell"
+                check_known(name, self.tool.markers, told, "[tool.markers_m] has")
         least = None if sight is None else sight.min_markers
         require(
             least is None or least <= len(self.tool.markers),
             f"{where}: key workspace.visibility.min_markers is {least}, but [tool.markers_m] has "
             f"{listed(self.tool.markers) or 'none'}; ask for fewer",
         )
-        sigmas = wish("marker_sigma", f"{where}: [design.marker_sigma_um]")
-        self._check_markers(sigmas, self.design.marker_sigma)
-        freedom = self.design.choose
-        chosen = f"{where}: [design.choose.markers_m]"
-        self._check_markers(chosen, freedom.markers if freedom else ())
         require(
             not self.workspace.urdf_geometry or self.robot.urdf is not None,
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
@@ -457,11 +446,6 @@ class Cell:
                 told = f"{where}: key model.effects[{i}] names the unknown effect"
                 told = f"{told} {quoted(choice.name)}"
                 check_known(choice.name, tuple(known_effects), told, "known effects:")
-
-    def _check_markers(self, table: str, names: Iterable[str]) -> None:
-        for name in names:
-            told = f"{table} names {quoted(name)}, which is no marker of the cell"
-            check_known(name, self.tool.markers, told, "[tool.markers_m] has")
 
 
 read_cell = Cell.read

@@ -24,6 +24,7 @@ from elastocal.config import (
     Numbers,
     Positive,
     Positives,
+    Record,
     Rotation,
     Spot,
     Table,
@@ -42,7 +43,6 @@ from elastocal.config import (
     keys_of,
     numbers,
     optional,
-    record,
     several,
     stated,
     turn_key,
@@ -63,8 +63,7 @@ POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 OF_THE_FILE = "the name of a link of the URDF, or of a body{} of the MuJoCo model"
 
 
-@record
-class Robot:
+class Robot(Record):
     """A URDF or a MuJoCo model with the names of its first and last link, or a DH table.
 
     `masses`: the table of link masses of a DH robot.  `dh` takes a UR's factory calibration too: a
@@ -158,8 +157,7 @@ class Robot:
         return cls(dh=Path(path), dh_convention=convention, masses=links)
 
 
-@record
-class Tool:
+class Tool(Record):
     """`load_point` (3,) and `markers` name → (3,), in m in the flange frame.
 
     Examples:
@@ -180,15 +178,13 @@ class Tool:
             )
 
 
-@record
-class CartesianNoise:
+class CartesianNoise(Record):
     """Standard deviations (3,) in m along x, y, z of the tracker frame; one number for all."""
 
     sigma: Sigma = keyed("sigma_um", note=", or three for x, y, z", required=False)
 
 
-@record
-class PolarNoise:
+class PolarNoise(Record):
     """Range and transverse standard deviation: constant part in m, part per metre of range (1)."""
 
     range: Positive = keyed("range_um", required=False)
@@ -197,8 +193,7 @@ class PolarNoise:
     transverse_per_m: NonNegative = keyed("transverse_ppm", required=False)
 
 
-@record
-class Tracker:
+class Tracker(Record):
     """`position` (3,) m: where the instrument stands in the frame of the data.
 
     `anchor` (3,) m: nominal cable or ball-bar anchor for distances.
@@ -236,8 +231,7 @@ class Tracker:
         return {"noise": from_table(PolarNoise, known | table, spot)}
 
 
-@record
-class Unsteadiness:
+class Unsteadiness(Record):
     """What differs from visit to visit, beside the noise of a reading, and the tails of that noise.
 
     `joints` (joints,) or (1,), in rad or m: by how much each joint settles elsewhere at each visit.
@@ -273,8 +267,7 @@ class Unsteadiness:
         return np.broadcast_to(self.joints, (n,))
 
 
-@record
-class EffectChoice:
+class EffectChoice(Record):
     """One entry of `effects`: "joint_compliance", or "joint_compliance:joint2" for one place."""
 
     name: str
@@ -310,8 +303,7 @@ class CompensatorTable(Table):
     free_length_m: AnyFloat | None = key("a number in m, below 0 with initial tension")
 
 
-@record
-class Nominal:
+class Nominal(Record):
     """Nominal values and start hints; compliances in rad/(N m), base rotation (3, 3).
 
     `settings`: place → key → value of the constants that effects do not fit, in the key's unit.
@@ -353,8 +345,7 @@ class Nominal:
         return replace(self, **known)
 
 
-@record
-class ModelSpec:
+class ModelSpec(Record):
     """What is observed, which effects are fitted, and what drives and settles the springs.
 
     `effects` may be stated as texts, "effect" or "effect:where".
@@ -394,8 +385,7 @@ FORCE = partial(optional, "load_N", note=", a force in the data's frame")
 POINT = partial(optional, "point_m", note=", a point in the flange frame")
 
 
-@record
-class TargetPose:
+class TargetPose(Record):
     """A test pose, where position must be right: joints `q` (n,) rad or m and force (3,) N.
 
     `point` (3,) m in the flange frame; None: the markers themselves where their places are fitted,
@@ -415,8 +405,7 @@ class TargetPose:
         return {"degrees": "q_deg" in table}
 
 
-@record
-class TargetPath:
+class TargetPath(Record):
     """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
 
     file: File = keyed(
@@ -426,8 +415,7 @@ class TargetPath:
     point: Vector3 | None = POINT()
 
 
-@record
-class TargetBox:
+class TargetBox(Record):
     """`count` test poses with the point inside a box (m, data's frame), sampled.
 
     `rotation` (3, 3) of the flange in the data's frame, None for any that the arm reaches.
@@ -449,8 +437,7 @@ class TargetBox:
         )
 
 
-@record
-class Motion:
+class Motion(Record):
     """How the arm moves between poses: joint `speed` (n,) rad/s or m/s, (1,) where all are alike
     (None: equal speeds), `home` (n,), `dwell` s of a stop and `reading` s more for each reading of
     a marker in it, `load_change` s for hanging or taking off the load by hand, `both_directions`:
@@ -499,8 +486,7 @@ Box = Annotated[Array, numbers(2, 3), holding(lambda ends: bool((ends[0] <= ends
 BOX = "two corners in m, the lower first, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
 
 
-@record
-class Freedom:
+class Freedom(Record):
     """What may still be chosen before measuring: boxes (2, 3) m, lower and upper corner, for
     `markers` by name and the `load_point` (flange frame) and for the `tracker` (data's frame), and
     how many of the design's `loads` that are not zero will hang."""
@@ -537,8 +523,7 @@ class LevelsTable(Table):
     )
 
 
-@record
-class DesignSpec:
+class DesignSpec(Record):
     """`criterion`: the name of one that planning has.
 
     `levels` joint → values and `per_level` their numbers of poses (for at most one joint); `loads`

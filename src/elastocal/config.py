@@ -1,6 +1,6 @@
 """TOML files that users write: read with a bound on their size, and checked key by key.
 
-A table of a file is a `record`, a frozen dataclass in SI units that Python code may build as well,
+A table of a file is a `Record`, a frozen dataclass in SI units that Python code may build as well,
 or a `Table`, a pydantic model of what only files state.  Either says of each key what it takes, and
 `checked` reads a table by walking through its keys.  What is wrong is told as one sentence: file,
 key, what the key takes, what was found, and the nearest valid name.
@@ -89,7 +89,7 @@ UNITS = {
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
-Record = TypeVar("Record")
+Stated = TypeVar("Stated")
 Member = TypeVar("Member")
 Into = Callable[[Any, "Spot", str], Any]
 
@@ -149,25 +149,23 @@ def keyed(
     return field(metadata={"keys": tuple(keys or own)}, **default)
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(field, keyed))
-def record(cls: type[Record]) -> type[Record]:
-    """Make a class a frozen dataclass whose fields are checked, in SI units, and compared as
-    `ByValue` does.  A wrong argument is an InputError that names class, field, what it takes and
-    what was found."""
-    made: Any = pydantic_dataclass(frozen=True, eq=False, config=STRICT)(cls)
-    for name in ("_compared", "__eq__", "__hash__"):
-        setattr(made, name, vars(ByValue)[name])
-    checked_init = made.__init__
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field, keyed))
+class Record(ByValue):
+    """Each class derived from it is a frozen dataclass whose fields are checked, in SI units.  A
+    wrong argument is an InputError that names class, field, what it takes and what was found."""
 
-    @wraps(checked_init)
-    def init(self: Any, *args: Any, **kwargs: Any) -> None:
-        try:
-            checked_init(self, *args, **kwargs)
-        except ValidationError as error:
-            raise InputError(_wrong_argument(made, error)) from None
+    def __init_subclass__(cls) -> None:
+        made: Any = pydantic_dataclass(frozen=True, eq=False, config=STRICT)(cls)
+        checked_init = made.__init__
 
-    made.__init__ = init
-    return made
+        @wraps(checked_init)
+        def init(self: Any, *args: Any, **kwargs: Any) -> None:
+            try:
+                checked_init(self, *args, **kwargs)
+            except ValidationError as error:
+                raise InputError(_wrong_argument(made, error)) from None
+
+        made.__init__ = init
 
 
 def _wrong_argument(cls: Any, error: ValidationError) -> str:
@@ -300,8 +298,8 @@ class Spot:
         require(condition, f"{self.path}: {sentence}")
 
 
-def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> Record:
-    found: Record = _table(table, data, Spot(where, root=table), "a table")
+def checked(table: type[Stated], data: Mapping[str, Any], where: str | Path) -> Stated:
+    found: Stated = _table(table, data, Spot(where, root=table), "a table")
     return found
 
 
@@ -327,7 +325,9 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     return from_table(cls, found, spot)
 
 
-_adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}  # by what is kept beside them
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind, config=STRICT)
 
 
 def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any:
@@ -346,9 +346,7 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
     keys, problem = spot.keys, ""
     if not is_table(members[0]):
         try:
-            if id(kind) not in _adapters:
-                _adapters[id(kind)] = kind, TypeAdapter(kind, config=STRICT)
-            return _adapters[id(kind)][1].validate_python(found)
+            return _adapter(kind).validate_python(found)
         except ValidationError as error:
             first = error.errors(include_url=False, include_context=False)[0]
             problem, path = first["type"], first["loc"]
@@ -362,7 +360,7 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
     raise InputError(f"{spot.path}: key {place(*keys)} takes {takes}; found {shown(found)}{hint}")
 
 
-def from_table(cls: type[Record], table: Mapping[str, Any], spot: Spot, **values: Any) -> Record:
+def from_table(cls: type[Stated], table: Mapping[str, Any], spot: Spot, **values: Any) -> Stated:
     """The record that the checked values of a table state, in SI units; `values` are known.
     `cls.from_keys(table, spot)`, where there is one, gives the fields that several keys state
     together; each other field is stated by one of its keys."""

@@ -21,14 +21,15 @@ import signal
 import stat
 import sys
 import threading
-from collections.abc import Collection, Iterator, Sequence
+import traceback
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, BinaryIO
 
-from elastocal.messages import SHOWN, InputError, option, quoted, raised_at, require
+from elastocal.messages import SHOWN, InputError, listed, option, quoted, raised_at, require
 
 # What is being written ends so, after the number of the process that writes it.
 UNFINISHED = ".tmp"
@@ -424,6 +425,52 @@ def _running(where: str, path: str = "") -> Iterator[None]:
         file, line = found or foreign or ("", 0)
         text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
         raise InputError(f"{where}: {file}, line {line}: {text}; correct the plug-in") from error
+
+
+# Set, the command line shows the traceback of what no message foresees.
+TRACEBACK = "ELASTOCAL_TRACEBACK"
+INTERNAL = 70  # what sysexits.h calls a fault of the software
+
+
+def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
+    """What a library raised as a sentence that names the files `read`, and the exit code.  Memory
+    that ends and numbers that cannot be computed with come from the input; whatever else code of
+    elastocal raises is a fault of its own, and asked to be reported."""
+    what = f"{type(error).__name__}: {error}".rstrip(": ")
+    if plugin := _of_plugin(error):
+        return f"{plugin}: {what}; correct the plug-in", 2
+    named = [str(p) for p in read if p is not None for p in (p if isinstance(p, list) else [p])]
+    files, (file, line) = listed(named) or "the options", raised_at(error, bool) or ("", 0)
+    numbers = isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError"
+    if isinstance(error, MemoryError):
+        told = f"memory ends ({what}); give fewer readings, or ask for less by the options"
+    elif numbers or (isinstance(error, ValueError | RuntimeError) and not file.startswith(OURS)):
+        told = (
+            f"holds numbers, or options give some, that cannot be computed with ({what}); look for "
+            "values far too large or too small, or in another unit"
+        )
+    else:
+        told = (
+            f"not foreseen: {what} at {Path(file).name}, line {line}. Please report this fault of "
+            f"elastocal with the command and its files ({TRACEBACK}=1 shows where)"
+        )
+        return f"{files}: {told}", INTERNAL
+    return f"{files}: {told}", 1
+
+
+def _of_plugin(error: Exception) -> str:
+    """Where a plug-in raised `error`, or what it gave did; else empty."""
+    ran = set(map(str, RAN))
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        file, mine = frame.f_code.co_filename, frame.f_locals.values()
+        kinds = [v if isinstance(v, type) else type(v) for v in mine]
+        for plugin in (kind for kind in kinds if kind in REGISTERED):
+            home = getattr(sys.modules.get(plugin.__module__), "__file__", file)
+            at = f"{home}, line {line}" if file == home else home
+            return f"{at}: '{getattr(plugin, 'name', plugin.__name__)}'"
+        if file in ran:
+            return f"{file}, line {line}"
+    return ""
 
 
 def check_registered(thing: object, base: type, what: str, example: str) -> None:

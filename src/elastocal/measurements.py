@@ -518,8 +518,6 @@ def read_measurements(
     plan `level` and `order`, which a designed one has, are passed over.
     Quaternions become rotation vectors.  With `text` the table is that CSV text, and `path` only
     its name.
-
-    Raises InputError that names file, line, column and the offending text.
     """
 
     def choose(header: Sequence[str]) -> Columns:
@@ -642,13 +640,9 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
         told = "cannot stand in a table; use one line without blanks at its ends"
         require(is_label(name), f"label {quoted(name)} {told}")
     columns = measurements.columns()
-    infinite = {header for header, values in columns.items()
-                if values.dtype != object and not np.isfinite(values).all()}  # fmt: skip
-    for family in families(measurements.kinds).values():
-        require(
-            infinite.isdisjoint(name for stem in family.units for name in family.columns(stem)),
-            f"{path}: the {family.meaning} to write are not all finite",
-        )
+    for header, values in columns.items():
+        finite = values.dtype == object or np.isfinite(values).all()
+        require(finite, f"{path}: the numbers of {header} to write are not all finite")
     if Path(path).suffix.lower() in tables.PARQUET:
         return tables.write_parquet(path, columns)
     # A few at a time as numbers of Python, which are written with the shortest digits that read

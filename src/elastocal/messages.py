@@ -20,7 +20,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager
 from decimal import Decimal
 from difflib import get_close_matches
-from pathlib import Path
 from typing import Any
 
 SHOWN = 60
@@ -300,38 +299,6 @@ def wish(keyword: str, key: str) -> str:
     return option(keyword) if keyword in _said["given"] else key
 
 
-# Set, the command line shows the traceback of what no message foresees.
-TRACEBACK = "ELASTOCAL_TRACEBACK"
-INTERNAL = 70  # what sysexits.h calls a fault of the software
-
-
-def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
-    """What a library raised as a sentence that names the files `read`, and the exit code.  Memory
-    that ends and numbers that cannot be computed with come from the input; whatever else code of
-    elastocal raises is a fault of its own, and asked to be reported."""
-    what = f"{type(error).__name__}: {error}".rstrip(": ")
-    if plugin := _of_plugin(error, what):
-        return plugin, 2
-    named = [str(p) for p in read if p is not None for p in (p if isinstance(p, list) else [p])]
-    files, (file, line) = listed(named) or "the options", raised_at(error, bool) or ("", 0)
-    ours = Path(file).is_relative_to(Path(__file__).parent)
-    numbers = isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError"
-    if isinstance(error, MemoryError):
-        told = f"memory ends ({what}); give fewer readings, or ask for less by the options"
-    elif numbers or (isinstance(error, ValueError | RuntimeError) and not ours):
-        told = (
-            f"holds numbers, or options give some, that cannot be computed with ({what}); look for "
-            "values far too large or too small, or in another unit"
-        )
-    else:
-        told = (
-            f"not foreseen: {what} at {Path(file).name}, line {line}. Please report this fault of "
-            f"elastocal with the command and its files ({TRACEBACK}=1 shows where)"
-        )
-        return f"{files}: {told}", INTERNAL
-    return f"{files}: {told}", 1
-
-
 def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, int] | None:
     """File and line of the last of a traceback's frames whose file is somebody's `own`, of a
     SyntaxError those that it names; None where there is none."""
@@ -341,28 +308,6 @@ def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, in
         return error.filename, error.lineno or 1
     frames = traceback.extract_tb(error.__traceback__)
     return next(((f.filename, f.lineno or 1) for f in frames[::-1] if own(f.filename)), None)
-
-
-def _of_plugin(error: Exception, what: str) -> str:
-    """Whose fault it is where a plug-in raised `error`, or what it gave did; else empty."""
-    import sys
-    import traceback
-
-    loader: Any = sys.modules.get("elastocal.files")
-    if loader is None:
-        return ""
-    ran = {str(path) for path in loader.RAN}
-    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
-        file, mine = frame.f_code.co_filename, frame.f_locals.values()
-        kinds = [v if isinstance(v, type) else type(v) for v in mine]
-        for plugin in (kind for kind in kinds if kind in loader.REGISTERED):
-            home = getattr(sys.modules.get(plugin.__module__), "__file__", file)
-            at = f"{home}, line {line}" if file == home else home
-            name = getattr(plugin, "name", plugin.__name__)
-            return f"{at}: '{name}': {what}; correct the plug-in"
-        if file in ran:
-            return f"{file}, line {line}: {what}; correct the plug-in"
-    return ""
 
 
 @contextmanager

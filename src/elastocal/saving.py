@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from string import Formatter
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -251,7 +252,7 @@ class Language(NamedTuple):
 
 
 # Joint values are A1 … A6 = joints 1 … 6; of the greatest axis speed and acceleration 10 %.
-KRL = Language("KRL", 6, 180 / math.pi, {
+KRL = Language("KUKA KRL", 6, 180 / math.pi, {
     "head": """\
 &ACCESS RVP
 &REL 1
@@ -294,6 +295,9 @@ def {name}():
     "foot": "end\n\n{name}()\n",
 })  # fmt: skip
 LANGUAGES = {".src": KRL, ".script": URSCRIPT}
+# What stands in the place of a text's nothing, {} and {name}, and of all else: `plain` ASCII.
+HELD = {None: "", "": r"(-?[0-9]+(?:\.[0-9]+)?)", "name": r"\w+"}
+PLAIN = r"[ !#-\[\]-~]*"
 
 
 def plain(text: str) -> str:
@@ -357,13 +361,11 @@ def program_steps(text: str) -> list[tuple[str, Array]]:
     """The texts that a program written here consists of, in their order, with their numbers:
     ("move", joints (6,) rad), ("measure", seconds (1,)), and others without any."""
     language = KRL if text.startswith("&ACCESS") else URSCRIPT
-    held = {"name": r"\w+", "note": r"[ !#-\[\]-~]*"}  # ASCII without quotation marks, backslashes
-    held |= {"told": held["note"], "limits": held["note"]}
     kinds = {}
-    for kind, words in language.texts.items():
-        empty = re.escape(words.format(*["\0"] * AXES, **{name: f"\1{name}\1" for name in held}))
-        empty = empty.replace("\0", r"(-?[0-9]+(?:\.[0-9]+)?)")
-        kinds[kind] = re.compile(re.sub("\1(.*?)\1", lambda name: held[name[1]], empty), re.ASCII)
+    for kind, template in language.texts.items():
+        parts = Formatter().parse(template)
+        way = "".join(re.escape(words) + HELD.get(field, PLAIN) for words, field, *_ in parts)
+        kinds[kind] = re.compile(way, re.ASCII)
     steps, at = [], 0
     while at < len(text):
         found = {kind: match for kind, way in kinds.items() if (match := way.match(text, at))}

@@ -37,22 +37,17 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 else:
     globals().update(later(
+        "elastocal CalibratedArm Calibration Cell Compensation Diagnosis Knowledge Measurements",
+        "elastocal Model Plan",
+        "elastocal.cell_tables Freedom Motion TargetBox TargetPath TargetPose",
+        "elastocal.compensation Targets",
+        "elastocal.identification.knowledge Constraints GaussianPrior",
+        "elastocal.identification.start FaultyReadings IntervalKind Method",
+        "elastocal.identification.weighted_problem WeightKind",
+        "elastocal.planning.design Effort",
+        "numpy.random Generator",
         "numpy.typing ArrayLike",
         "pandas DataFrame",
-        "elastocal.cell_tables Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.cell Cell",
-        "elastocal.compensation Compensation Targets",
-        "elastocal.diagnosis.diagnosis Diagnosis",
-        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
-        "elastocal.identification.start FaultyReadings IntervalKind Method",
-        "elastocal.identification.result Calibration",
-        "elastocal.identification.weighted_problem WeightKind",
-        "elastocal.measurements Measurements",
-        "elastocal.model.calibrated CalibratedArm",
-        "elastocal.model.manipulator Model",
-        "elastocal.planning.design Effort",
-        "elastocal.planning.plan Plan",
-        "numpy.random Generator",
     ))  # fmt: skip
 
 # Each verb imports what it calls: one should not load another, and --help none of them.
@@ -191,7 +186,7 @@ def design_request(
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.poses import read_pins, shares_of
 
-    cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
+    cell = model.cell if isinstance(model, Model) else cell_of(model)
     search = {name: asked.pop(name) for name in ("effort", "seed", "jobs") if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
@@ -207,7 +202,7 @@ def design_request(
     known = None if all(file is None for file in files) else Model(cell)
     if augment is not None and known is not None:
         own = model if isinstance(model, Model) else known
-        done = measurements_of(own, "augment", augment)
+        done = measurements_of(own, augment)
         known = own.with_markers_of(done)
         cell = cell if own is known else replace(cell, tool=known.cell.tool)
     stated, notes = (None, ()) if known is None else _prior_of(knowledge, known)
@@ -219,7 +214,7 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins, asked=named,
+        **search, fixed=_names(fixed), done=done, notes=notes, pins=pins, asked=named,
         prior=_gaussian(prior) if stated is None else stated, curve=tuple(sorted({*curve})),
     )  # fmt: skip
     return cell, options
@@ -239,7 +234,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
     made: dict[str, Callable[[Any], Any]] = {
         "criterion": lambda name: criterion_named(name, option("criterion")) and name,
-        "interest": lambda names: _names("interest", names),
+        "interest": _names,
         "loads": lambda forces: np.atleast_2d(np.asarray(forces, dtype=float)),
         "test_poses": test_poses,
         "test_path": lambda at: wish.TargetPath(Path(at)) if isinstance(at, str | Path) else at,
@@ -475,14 +470,14 @@ def identify(
     matrix = None if covariance is None else np.asarray(covariance, dtype=float)
     options = Options(
         method=method, noise=noise, weights=weights, covariance=matrix, intervals=intervals,
-        fixed=_names("fixed", fixed), faulty=outliers, seed=cast(int, seed),
+        fixed=_names(fixed), faulty=outliers, seed=cast(int, seed),
     )  # fmt: skip
     known = knowledge_of(knowledge, physical or bounded)
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = measurements_of(made, "data", data)
-    kept_back = None if test is None else measurements_of(made, "test", test)
+    table = measurements_of(made, data)
+    kept_back = None if test is None else measurements_of(made, test)
     made = made.with_markers_of(*(t for t in (table, kept_back) if t is not None))
     prior = _gaussian(prior)
     if known is not None:
@@ -547,13 +542,13 @@ def diagnose(
     from elastocal.diagnosis.diagnose import diagnose as run
     from elastocal.model.manipulator import measurements_of
 
-    options = DiagnosisOptions(cast(int, seed), _names("without", without), false_alarm)
+    options = DiagnosisOptions(cast(int, seed), _names(without), false_alarm)
     if extra_poses is not None:
         whole("extra_poses", extra_poses, 1)
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = measurements_of(made, "data", data)
+    table = measurements_of(made, data)
     made = made.with_markers_of(table)
     found = run(made, table, options, tell)
     if extra_poses is None or not found.open:
@@ -613,10 +608,10 @@ def compensate(
     import numpy as np
 
     from elastocal.compensation import compensate as run
-    from elastocal.model.calibrated import given_arm, tool_point
+    from elastocal.model.calibrated import CalibratedArm, tool_point
     from elastocal.model.effects.base import given_force
 
-    arm = given_arm("arm", arm)
+    arm = arm if isinstance(arm, CalibratedArm) else arm.arm
     force = given_force(load)
     check_frame(frame)
     chain = arm.model.chain
@@ -653,10 +648,7 @@ def _targets(
         return targets
     if isinstance(targets, str | Path):
         return read_targets(targets, kinds, frame, force)
-    try:
-        found = np.asarray(targets, dtype=float)
-    except (TypeError, ValueError):
-        found = np.zeros(0)
+    found = np.asarray(targets, dtype=float)
     if found.shape in ((3,), (4, 4)):
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
@@ -664,7 +656,6 @@ def _targets(
     right = placed and len(found) > 0
     told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found"
     require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
-    require(bool(np.isfinite(found).all()), f"{option('targets')} {told} NaN or infinity")
     if oriented:
         R, last = found[:, :3, :3], found[:, 3] - [0, 0, 0, 1]
         off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() + np.abs(last).max()
@@ -674,7 +665,8 @@ def _targets(
     return targets_at("targets", found, None, frame, force)
 
 
-def effects(cell: Any = None) -> DataFrame:
+@checked_arguments
+def effects(cell: AnyModel | None = None) -> DataFrame:
     """The physical effects that can be fitted.
 
     Args:
@@ -695,11 +687,11 @@ def effects(cell: Any = None) -> DataFrame:
     """
     import pandas as pd
 
-    from elastocal.model.manipulator import effect_entries
+    from elastocal.model.manipulator import Model, effect_entries
     from elastocal.simulation import DEMO
 
     given = DEMO / "cell.toml" if cell is None else cell
-    return pd.DataFrame(effect_entries(_checked_cell(getattr(given, "cell", given), "cell")))
+    return pd.DataFrame(effect_entries(given.cell if isinstance(given, Model) else given))
 
 
 def _silent(message: str) -> None:
@@ -709,14 +701,7 @@ def _silent(message: str) -> None:
 def _model(given: AnyModel) -> Model:
     from elastocal.model.manipulator import Model
 
-    return given if isinstance(given, Model) else Model(_checked_cell(given))
-
-
-def _checked_cell(given: Any, name: str = "model") -> Cell | str | Path:
-    if isinstance(given, str | Path) or type(given).__name__ == "Cell":
-        return given
-    told = "takes a Model, a Cell or the path of a cell file"
-    raise InputError(f"{option(name)} {told}; found {type(given).__name__}")
+    return given if isinstance(given, Model) else Model(given)
 
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
@@ -733,11 +718,8 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
 
     if prior is None or isinstance(prior, GaussianPrior):
         return prior
-    told = 'takes mean and std by parameter, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}'
-    named = isinstance(prior, Mapping) and all(isinstance(v, Mapping) for v in prior.values())
-    require(named, f"{option('prior')} {told}; found {shown(prior)}")
     return GaussianPrior.from_dict(prior)
 
 
-def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
+def _names(given: str | Sequence[str]) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(given)

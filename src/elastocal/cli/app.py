@@ -13,9 +13,7 @@ what stands for a value, as in "set_ (KEY=VALUE): Option of the study".
 from __future__ import annotations
 
 import functools
-import gc
 import inspect
-import logging
 import os
 import re
 import shlex
@@ -44,25 +42,16 @@ from typer.core import TyperGroup
 
 from elastocal import __version__
 from elastocal.above import LARGEST_SEED, kinds_of
-from elastocal.files import check_output, is_plugin_file, together
+from elastocal.files import TRACEBACK, check_output, explained, is_plugin_file, together
 from elastocal.messages import (
-    TRACEBACK,
     ElastocalError,
     InputError,
-    explained,
     flag_of,
     json_text,
     require,
     saying,
 )
-from elastocal.screen import (
-    complain,
-    interrupts,
-    progress_line,
-    safe_console,
-    say,
-    spelling,
-)
+from elastocal.screen import complain, interrupts, progress_line, safe_console, say
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,9 +61,6 @@ if TYPE_CHECKING:
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
 HELP = ["-h", "--help"]
-# New containers between two searches for garbage in cycles.  Python's own 700 has every import and
-# every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
-COLLECT_AFTER = 200_000
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
 READ = (
@@ -165,20 +151,6 @@ def options(
     chosen_backend()
     if os.environ.get("ELASTOCAL_CACHE"):
         complain("ELASTOCAL_CACHE is no longer read, as nothing is kept between runs; unset it")
-
-
-def run_app() -> None:
-    gc.set_threshold(COLLECT_AFTER)
-    # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    try:
-        with spelling():
-            # The same name however it is called: completion scripts are made of it.
-            app(prog_name="elastocal")
-    finally:
-        # Python ends by looking for garbage once more, which takes 0.17 s, as long as fitting a
-        # small table does.
-        gc.freeze()
 
 
 def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool = False) -> int:

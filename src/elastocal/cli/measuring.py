@@ -126,7 +126,6 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     screen.print('In the cell: [model] effects = ["joint_offset", "backlash:joint2"].')
 
 
-PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 CURVE = "--curve takes numbers of poses, as in 10,15,20"
 
 
@@ -179,14 +178,14 @@ def design(
     from elastocal.planning.poses import plan_and_names
     from elastocal.report.arm_view import write_plan_picture
     from elastocal.report.renderers import print_report
-    from elastocal.saving import beside, save_plan
+    from elastocal.saving import LANGUAGES, beside, save_plan
 
     summary = beside(output)
     programs = program or []
-    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
+    kinds = " or ".join(f"{suffix} for {way.title}" for suffix, way in LANGUAGES.items())
     for path in programs:
         told = f"--program {path}: the suffix says the language, {kinds}"
-        require(path.suffix.lower() in PROGRAMS, told)
+        require(path.suffix.lower() in LANGUAGES, told)
     require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
     run.writes(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),

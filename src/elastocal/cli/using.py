@@ -63,7 +63,7 @@ def identify(
     """
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.renderers import print_report, write_page
-    from elastocal.saving import save_published, save_residuals
+    from elastocal.saving import save_residuals
 
     run.writes(
         (output, ".json"), (report, PAGES), (residuals, ".csv"), (certificate, f"{PAGES} .xml")
@@ -76,7 +76,7 @@ def identify(
         result = verbs.identify(known, data, **asked, progress=progress)
         page = partial(write_page, result, inputs=inputs, command=repeated(), seed=asked["seed"])
         run.write(
-            (output, partial(save_published, result)),
+            (output, result.save),
             (residuals, partial(save_residuals, result)),
             (report, page),
             (certificate, partial(page, certificate=True)),
@@ -122,7 +122,6 @@ def diagnose(
     """
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.renderers import print_report, write_page
-    from elastocal.saving import save_published
 
     require(
         poses is None or plan is not None,
@@ -138,7 +137,7 @@ def diagnose(
         assert model is not None  # `diagnose` states it
         told = [f"wrote {path}" for path in (output, report) if path is not None]
         run.write(
-            (output, partial(save_published, found)),
+            (output, found.save),
             (report, lambda path: write_page(found, path, [cell, data], repeated(), asked["seed"])),
             (plan, lambda path: told.append(_write_extra_poses(path, found, model.chain.kinds))),
             (cell_out, lambda path: told.extend(_write_extended(path, found, data, run.plugins))),
@@ -382,7 +381,6 @@ def compare(
     from elastocal.diagnosis.changes import compare as compared
     from elastocal.model.calibrated import read_calibrated
     from elastocal.report.renderers import print_report, write_page
-    from elastocal.saving import save_published
 
     if old_order := new is None:
         cell, old, new = _in_old_order(cell, old, cell_of_old)
@@ -397,7 +395,7 @@ def compare(
         progress("comparing")
         found = compared(*arms, load=load, level=level, poses=poses, seed=seed)
     run.write(
-        (output, partial(save_published, found)),
+        (output, found.save),
         (report, lambda path: write_page(found, path, inputs, repeated(), seed)),
     )
     run.answer(found.to_json, lambda screen: print_report(screen, found))

@@ -51,7 +51,6 @@ from elastocal.model.calibrated import (
     Conditions,
     ToolPoint,
     arm_with,
-    given_arm,
     random_table,
     unstated_needs,
 )
@@ -224,7 +223,7 @@ def compare(
         >>> ec.compare(fit, fit).verdict
         'no_change_shown'
     """
-    before, after = given_arm("old", old), given_arm("new", new)
+    before, after = (a if isinstance(a, CalibratedArm) else a.arm for a in (old, new))
     require(
         2 <= poses <= MOST_POSES,
         f"{option('poses')} takes a whole number from 2 to {MOST_POSES}; found {poses}",

@@ -163,7 +163,7 @@ def next_poses(
     check(0 <= least_gain < 1, f"{option('least_gain')} takes a share from 0 to below 1")
     tell: Progress = progress or (lambda message: None)
     model = model if isinstance(model, Model) else Model(model)
-    table = measurements_of(model, "data", data)
+    table = measurements_of(model, data)
     model = model.with_markers_of(table)
     asked = _asked(model.cell, table, batch, candidates)
     shares_of(asked, batch, "batch")  # each level takes a pose

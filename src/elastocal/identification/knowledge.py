@@ -19,6 +19,7 @@ from elastocal.config import (
     Key,
     Many,
     Positive,
+    Record,
     Spot,
     Table,
     Text,
@@ -26,7 +27,6 @@ from elastocal.config import (
     key,
     keyed,
     read_toml,
-    record,
 )
 from elastocal.engine import least_norm
 from elastocal.messages import (
@@ -141,8 +141,7 @@ FACTORS = (
 )
 
 
-@record
-class Bounds:
+class Bounds(Record):
     """lower ≤ x ≤ upper for one parameter, in its unit; equal bounds fix it."""
 
     name: str = keyed(
@@ -166,8 +165,7 @@ class Bounds:
         )
 
 
-@record
-class LinearEquality:
+class LinearEquality(Record):
     """Σ coefficient · x = value over the named parameters: a symmetry, a known sum."""
 
     terms: Annotated[dict[Text, float], Field(min_length=1)] = keyed(takes=FACTORS)
@@ -186,8 +184,7 @@ class LinearEquality:
         )
 
 
-@record
-class SemidefiniteMatrix:
+class SemidefiniteMatrix(Record):
     """A symmetric matrix of parameters that is positive semidefinite: no load gains energy.
 
     `entries` are its rows; an entry is a parameter's name, {name: coefficient, …}, or a number.
@@ -406,8 +403,7 @@ def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> Gauss
         return GaussianPrior.independent(tuple(tables), means, std) if tables else None
 
 
-@record
-class Knowledge:
+class Knowledge(Record):
     """What is known of the parameters besides the readings, in SI units.
 
     Attributes:

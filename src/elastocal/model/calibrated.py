@@ -16,7 +16,7 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.above import Saved, checked_arguments
 from elastocal.cell import Cell
-from elastocal.config import Many, Table, checked, is_number, key, keyed, record
+from elastocal.config import Many, Record, Table, checked, is_number, key, keyed
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, rounded
@@ -56,8 +56,7 @@ Matrix = Annotated[Array, _array()]
 Triples = Annotated[Array, _array(3)]
 
 
-@record
-class OpenParameters:
+class OpenParameters(Record):
     """The parameters D that the data left open, by `names` (D,), and what they stand for.
 
     `mixing` (K, D): a deviation of X_D went into the estimates of the K determined parameters as
@@ -74,8 +73,7 @@ class OpenParameters:
     redundant: Many[str] = keyed(takes="a list of names", default=())
 
 
-@record
-class ShownPoses:
+class ShownPoses(Record):
     """How sure a fit is where it was measured: of each of `configurations` the standard deviation
     in m of the place predicted from the others is `most` at most."""
 
@@ -93,8 +91,7 @@ class ShownPoses:
         return {"largest_std_um": self.most * 1e6, "configurations": self.configurations}
 
 
-@record
-class MeasuredVisits:
+class MeasuredVisits(Record):
     """Where an arm was measured: commanded joints `q` (k, joints) in rad or m, and the `force`
     (k, 3) N at each."""
 
@@ -110,8 +107,7 @@ class MeasuredVisits:
         }
 
 
-@record
-class Scatter:
+class Scatter(Record):
     """Covariance (K, K) of the determined parameters where configurations alone err independently
     (CR2), and its degrees of freedom (K,)."""
 
@@ -234,14 +230,6 @@ class CalibratedArm(Valued, Saved):
             True
         """
         return self.model.pose(q, self.x, load)
-
-
-def given_arm(name: str, given: Any) -> CalibratedArm:
-    arm = getattr(given, "arm", given)
-    if not isinstance(arm, CalibratedArm):
-        told = "takes a calibrated arm, as fit.arm or what read_calibrated gives; found"
-        raise InputError(f"{option(name)} {told} {type(arm).__name__}")
-    return arm
 
 
 def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:

@@ -476,14 +476,8 @@ class Model(ByValue):
         return self.symbolic.frames(*inputs, x, self.symbolic.equilibrium(inputs, x)[0])
 
 
-def measurements_of(model: Model, name: str, given: object) -> Measurements:
-    """What a function takes as its argument of that name: measurements, or their table."""
-    if isinstance(given, Measurements):
-        return given
-    told = "takes measurements (Model.read, Model.table) or the path of their table; found"
-    known = isinstance(given, str | Path) or hasattr(given, "to_csv")
-    require(known, f"{option(name)} {told} {type(given).__name__}")
-    return model.read(given)
+def measurements_of(model: Model, given: Measurements | str | Path | DataFrame) -> Measurements:
+    return given if isinstance(given, Measurements) else model.read(given)
 
 
 NOMINAL = "check force_*_N and [model.nominal] joint_compliance, which is in rad/(N m)"
