@@ -529,7 +529,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         )
     known = np.isin(arm.model.names, arm.determined)
     for group in smooth_groups(arm.model):
-        if group.basis is None or group.whole_turn or not known[group.columns].any():
+        if not group.follows or group.whole_turn or not known[group.columns].any():
             continue
         angle = c.q[:, group.joint]
         out = reached & ((angle < group.low) | (angle > group.high))

@@ -297,11 +297,11 @@ class _Writing:
         names, place = arm.model.names, {n: k for k, n in enumerate(arm.determined)}
         quantile = float(t_quantile(LEVEL, np.array(np.inf)))
         for group in smooth_groups(arm.model):
-            if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+            if not group.follows or not any(names[c] in place for c in group.columns.ravel()):
                 continue
             steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
-            x = group.grid(min(max(steps + 1, FEWEST), MOST))
-            waves = group.basis(x)
+            x = np.linspace(group.low, group.high, min(max(steps + 1, FEWEST), MOST))
+            waves = group.waves.at(x)
             for number, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
                 known = np.array([names[c] in place for c in columns])
                 at = [place[names[c]] for c in columns[known]]

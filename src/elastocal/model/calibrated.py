@@ -602,7 +602,7 @@ class CalibratedTool:
         with the joints' angles is an error of the arm and no part of the frames."""
         x = self.x.copy()
         for group in smooth_groups(self.calibrated.model):
-            if group.basis is not None and group.lasting:
+            if group.follows and group.lasting:
                 x[group.columns] = 0.0
         T, place, turn = self._frames(*rows, x)
         return T, place[..., 0], turn

@@ -3,11 +3,10 @@ chain, its expression, its traits."""
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -20,6 +19,9 @@ from elastocal.messages import InputError, listed, option, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, joint_index
 from elastocal.units import Array
+
+if TYPE_CHECKING:
+    from elastocal.model.effects.smooth import SmoothFunction
 
 
 @dataclass(frozen=True)
@@ -294,36 +296,6 @@ MOTION = "rad or m"  # unit of a parameter of a joint's motion, as the joint tur
 STIFFNESS, STATION, MARKER, OFFSET, ORDINARY, LINK = range(6)
 # Units of a motion along and about the axes of a frame.
 MOVE = ("m", "m", "m", "rad", "rad", "rad")
-
-FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
-
-
-@dataclass(frozen=True)
-class SmoothFunction:
-    """What shrunk parameters of an effect make up: a smooth function of one quantity of a row.
-
-    `follows` is a joint, "joint2", or "time"; `keys` (components, waves) are its parameters and
-    `units` (components,) those of its values.  `size` and `length` are the standard deviation and
-    the correlation length of its prior; between `low` and `high` it was measured (rad or s).
-    `basis` gives the waves (n, waves) at values (n,) of what it follows.
-    """
-
-    follows: str
-    keys: tuple[tuple[str, ...], ...]
-    units: tuple[str, ...]
-    size: float
-    length: float = math.nan
-    low: float = math.nan
-    high: float = math.nan
-    basis: Callable[[Array], Array] | None = None
-
-    @property
-    def lasting(self) -> bool:
-        return self.follows != "time"
-
-    @property
-    def whole_turn(self) -> bool:
-        return self.lasting and self.high - self.low >= FULL_TURN * 2 * math.pi
 
 
 class Effect:
