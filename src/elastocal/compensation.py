@@ -176,7 +176,7 @@ def _nearest(
     q, good = found.q[k], found.reached[k]
     if near is None or not good.any():
         return q[0], bool(good[0])
-    q = rigid.unwound(chain, q[good], near, task.lower, task.upper)
+    q = task.unwound(q[good], near)
     q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
     if chain.n_joints > (6 if task.oriented else 3):  # joints leave a choice
         q = task.nearest(q, np.array([place]), near)

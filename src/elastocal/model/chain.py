@@ -325,14 +325,11 @@ def names_told(chain: Chain) -> str:
 def _meanings(chain: Chain, meant: str | None) -> tuple[dict[str, str], list[str]]:
     """What a joint may be called → jointN, and the names of which one must say what is `meant`."""
     by_file = {name: number for number, name in file_names(chain).items()}
-    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
-    clash = clashing(chain)
-    if meant == "order":
-        return by_file | by_order, []
+    clash = [] if meant == "order" else clashing(chain)
     if clash:  # by the file: a number that is no name there means nothing
         same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
         return same | by_file, clash if meant is None else []
-    return by_order | by_file, []
+    return by_file | {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}, []
 
 
 def numbered(cell: Cell, chain: Chain) -> Cell:
