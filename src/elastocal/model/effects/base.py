@@ -530,13 +530,11 @@ class Entry(Effect):
         return len(self.units)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(
-            ParameterSpec(f"{self.name}_{k + 1}", unit, 0.0, 1e-4)
-            for k, unit in enumerate(self.units)
-        )
+        every = enumerate(self.units, start=1)
+        return tuple(ParameterSpec(f"{self.name}_{k}", unit, 0.0, 1e-4) for k, unit in every)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        self.enter(arm, place, ca.vertcat(*[p[f"{self.name}_{k + 1}"] for k in range(self.size)]))
+        self.enter(arm, place, ca.vertcat(*p.values()))
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         """Add the motion u (size,) to the chain's pieces."""

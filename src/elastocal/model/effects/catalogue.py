@@ -108,24 +108,20 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
             _check_known(f"nominal.{table}", "place", place, known, cell)
             for key in values:
                 _check_known(f"nominal.{table}", f"{what} of {place}", key, known[place], cell)
-    wanted: dict[str, list[str | None]] = {
-        name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
-    }
     for choice in cell.model.effects:
         _check_known("effects", "effect", choice.name, CATALOGUE, cell)
-        wanted.setdefault(choice.name, []).append(choice.where)
     chosen = []
     for name, effect in CATALOGUE.items():
-        asked = wanted.get(name, [])
-        places = effect.places(chain, cell) if asked else ()
-        told = (
-            f"{name} has no place on robot '{chain.name}' with observe = \"{cell.model.observe}\""
-        )
-        require(places or not asked, f"{cell.source}: [model] effects: {told}; leave it out")
-        for where in asked:
-            if where is not None:
-                _check_known("effects", f"place of {name}", where, places, cell)
-        chosen += [(effect, place) for place in places if None in asked or place in asked]
+        asked = [choice.where for choice in cell.model.effects if choice.name == name]
+        if not (asked or effect.acts_unasked(cell)):
+            continue
+        places = effect.places(chain, cell)
+        told = f"has no place on robot '{chain.name}' with observe = \"{cell.model.observe}\""
+        require(places, f"{cell.source}: [model] effects: {name} {told}; leave it out")
+        for where in filter(None, asked):
+            _check_known("effects", f"place of {name}", where, places, cell)
+        everywhere = None in asked or effect.acts_unasked(cell)
+        chosen += [(effect, place) for place in places if everywhere or place in asked]
     return chosen
 
 
@@ -400,12 +396,11 @@ def configuration_rows(
     # (inputs …, X) → B of one table row (size, columns)
     row = ca.Function("row", [*arm.inputs.values(), p], [B], {"cse": True})
     q = ca.SX.sym("q", arm.chain.n_joints)
-    x = ca.SX.sym("x", len(symbolic.parameters))
     given = dict(zip(arm.inputs, row_inputs(arm, template), strict=True))
     rows = []
     for i in range(len(template)):
         own = [q if name == "q" else ca.SX(ca.DM(value[i])) for name, value in given.items()]
-        rows.append(row(*own, x))
+        rows.append(row(*own, p))
     combined = (
         sum((float(w) * rows[i] for i, w in zip(line.indices, line.data, strict=True)), ca.SX(0))
         for line in (observed.combine[[k]] for k in range(observed.combine.shape[0]))
@@ -413,4 +408,4 @@ def configuration_rows(
     B = ca.vertcat(*combined)
     W, cse = ca.SX.sym("W", *B.shape), {"cse": True}
     gradient = ca.gradient(ca.dot(W, B), q)
-    return ca.Function("B", [q, x], [B], cse), ca.Function("adjoint", [q, x, W], [gradient], cse)
+    return ca.Function("B", [q, p], [B], cse), ca.Function("adjoint", [q, p, W], [gradient], cse)
