@@ -80,8 +80,7 @@ def _usual(model: Model, p: Parameter) -> float:
     if chain.kinds[i] != "revolute" or not statics.weight_torque(chain, i) > 0:
         return 0.0
     rated = statics.usual_over_stated_mass(chain) * (statics.rated_torque(chain, cell, i) or 0.0)
-    lever = sum(float(np.linalg.norm(T[:3, 3])) for T in chain.link_ends[i:])
-    lever += float(np.linalg.norm(cell.tool.load_point))
+    lever = sum(chain.lengths[i:]) + float(np.linalg.norm(cell.tool.load_point))
     return statics.RATED_WIND_UP / max(rated, _largest_load(cell) * lever / OF_RATED)
 
 

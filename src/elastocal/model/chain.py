@@ -66,6 +66,11 @@ class Chain:
         return [*(joint.placement for joint in self.joints[1:]), self.flange_placement]
 
     @property
+    def lengths(self) -> list[float]:
+        """Per link from its joint's frame to its distal one, in m."""
+        return [float(np.linalg.norm(T[:3, 3])) for T in self.link_ends]
+
+    @property
     def kinds(self) -> tuple[JointKind, ...]:
         return tuple(joint.kind for joint in self.joints)
 
@@ -187,7 +192,7 @@ def plausible(chain: Chain, source: object) -> Chain:
         length = float(np.linalg.norm(T[:3, 3]))
         told = f"{source}: {length:g} m before {place} is too long for a link; correct it"
         require(length <= MAX_LENGTH, f"{told}, or if lengths are in mm, state them in m")
-    whole = extent(chain)
+    whole = sum(chain.lengths)
     for good, size, meant in (
         (whole <= MAX_LENGTH, f"{whole:g} m",
          "millimetres, state them in m (DH table: d_mm, a_mm)"),
@@ -225,11 +230,6 @@ def jaw_told(chain: Chain, moved: str = "") -> list[str]:
         f"the last joint '{last.name}' looks like a jaw of a gripper; if it is, name what carries "
         "it as flange"
     ]
-
-
-def extent(chain: Chain) -> float:
-    """Length in m from joint to joint and on to the flange."""
-    return float(sum(np.linalg.norm(T[:3, 3]) for T in chain.link_ends))
 
 
 def near_the_arm(chain: Chain) -> Chain:

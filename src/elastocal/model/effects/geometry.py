@@ -353,8 +353,8 @@ class ThermalExpansion(WarmUp):
         return (cell.model.thermal_driver,)
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        lengths = [np.linalg.norm(T[:3, 3]) for T in chain.link_ends]
-        long = [link for link, m in zip(links(chain), lengths, strict=True) if m > SHORTEST]
+        pairs = zip(links(chain), chain.lengths, strict=True)
+        long = (link for link, length in pairs if length > SHORTEST)
         return (*long, "all")
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
