@@ -18,7 +18,7 @@ from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_mo
 from elastocal.messages import InputError, listed, option, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, joint_index
-from elastocal.units import Array
+from elastocal.units import Array, pose_at
 
 if TYPE_CHECKING:
     from elastocal.model.effects.smooth import SmoothFunction
@@ -108,15 +108,6 @@ def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
     return np.array([s if p.typical is None else p.typical for s, p in both])
 
 
-# The chain under construction: what effects change, and how it is put together.
-#
-#     commanded joints → transmission → links → loads → compliance → tool/markers → tracker
-#
-# All fields are CasADi expressions in the arm's inputs (what the table says of one row), its
-# parameters and the elastic deflections θ.  Positions and forces are in the data's frame
-# (tracker frame, z vertical).
-
-
 @dataclass(frozen=True, eq=False)  # a key, whatever its axis and law are made of
 class Spring:
     """One elastic degree of freedom: a small joint inserted into the chain.
@@ -140,7 +131,12 @@ class Spring:
 
 
 class Arm:
-    """Builder handed from effect to effect; `assemble` turns its pieces into positions."""
+    """The chain under construction, handed from effect to effect; `assemble` puts it together.
+
+    All fields are CasADi expressions in the arm's `inputs` (what the table says of one row), its
+    parameters and the elastic deflections θ.  Positions and forces are in the data's frame
+    (tracker frame, z vertical).
+    """
 
     def __init__(self, chain: Chain, cell: Cell) -> None:
         n = chain.n_joints
@@ -150,10 +146,8 @@ class Arm:
         self.q = [self.q_commanded[i] for i in range(n)]
         self.links = [rigid.constant(T) for T in chain.link_ends]
         nominal = cell.model.nominal
-        self.T_tracker_base = rigid.transform(
-            None if nominal.base_rotation is None else rigid.constant(nominal.base_rotation),
-            None if nominal.base_position is None else rigid.constant(nominal.base_position),
-        )
+        at = np.zeros(3) if nominal.base_position is None else nominal.base_position
+        self.T_tracker_base = rigid.constant(pose_at(at, nominal.base_rotation))
         self.markers = {name: rigid.constant(at) for name, at in cell.tool.markers.items()}
         self.load_point = rigid.constant(cell.tool.load_point)
         self.marker_rotation = {name: ca.SX.eye(3) for name in self.markers}

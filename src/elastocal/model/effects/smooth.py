@@ -54,7 +54,7 @@ from elastocal.model.effects.base import (
     links,
     turning_joints,
 )
-from elastocal.model.effects.geometry import BY_ORDER, JUMP_TIME, KEYS, Jump, came_from
+from elastocal.model.effects.geometry import BY_ORDER, JUMP_TIME, KEYS, Jump, came_from, magnitude
 from elastocal.model.effects.statics import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
@@ -235,12 +235,11 @@ class AnyMotion(DrivenEffect):
 class ResidualField(AnyMotion, SmoothEffect):
     """A place moves smoothly with joint angles or time, and nobody knows why.
 
-    u = Σ_c f_c(x_c) in every component of the motion at the place: of "jointN" its angle, of
-    "linkN" its end frame along and about its axes, of "base" the base, of "marker:NAME" the marker;
-    x_c are the joints' angles and the time.  Settings for each c, "joint2" or "time":
-    `field_c_size` (rad and m; 0, the default, where the field does not follow it), and
-    `field_c_length`, `field_c_low`, `field_c_high` in rad or s.  What a diagnosis finds and cannot
-    name: it corrects the arm where it was measured, and is no explanation.
+    u = Σ_c f_c(x_c) in every component of the motion, x_c the joints' angles and the time.
+    Settings for each c, "joint2" or "time": `field_c_size` (rad and m; 0, the default, where the
+    field does not follow it), and `field_c_length`, `field_c_low`, `field_c_high` in rad or s.
+    What a diagnosis finds and cannot name: it corrects the arm where it was measured, and is no
+    explanation.
     """
 
     name = "residual_field"
@@ -287,8 +286,7 @@ class ResidualField(AnyMotion, SmoothEffect):
 class ResidualStep(AnyMotion, Jump):
     """A place moves by u for t ≥ T, and nobody knows why: a knock, a clamp that slipped.
 
-    Of "jointN" its angle, of "linkN" its end frame along and about its axes, of "base" the base, of
-    "marker:NAME" the marker; u in rad and m with the prior size `step_size`, T = `step_time_s`.
+    u in rad and m with the prior size `step_size`, T = `step_time_s`.
     """
 
     name = "residual_step"
@@ -361,7 +359,7 @@ class TorqueResponse(JointResponse):
     sized_by = "torque_response_rad"
 
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
-        return ca.vertcat(u, u**3, ca.tanh(u / SHARP), _magnitude(u), u**2)
+        return ca.vertcat(u, u**3, ca.tanh(u / SHARP), magnitude(u, SHARP), u**2)
 
 
 class ApproachResponse(JointResponse):
@@ -382,11 +380,7 @@ class ApproachResponse(JointResponse):
         return () if cell.model.approach == BY_ORDER else self.needs
 
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
-        return side * ca.vertcat(1, _magnitude(u))
-
-
-def _magnitude(u: ca.SX) -> ca.SX:
-    return ca.sqrt(u**2 + SHARP**2) - SHARP
+        return side * ca.vertcat(1, magnitude(u, SHARP))
 
 
 class LoadResponse(LoadedEffect):
