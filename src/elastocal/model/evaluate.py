@@ -211,34 +211,27 @@ class BatchFunction:
         # In a thread of the caller's own one: who started it has shared the work out already.
         alone = threading.current_thread() is not threading.main_thread()
         threads = 1 if alone else max(1, min(len(blocks), thread_count()))
-        # Every thread runs in a copy of the caller's context, which holds `numpy.errstate`.
-        shares = (
-            (contextvars.copy_context(), blocks[share])
-            for share in row_blocks(len(blocks), -(-len(blocks) // threads))
-        )
-        list(ahead(lambda s: s[0].run(self._carry_out, arrays, results, s[1]), shares, threads))
+        # Each runs in a copy of the caller's context, which holds `numpy.errstate`.
+        work = ((contextvars.copy_context(), block) for block in blocks)
+        list(ahead(lambda w: w[0].run(self._carry_out, arrays, results, w[1]), work, threads))
         return results
 
     def _carry_out(
-        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
+        self, inputs: Sequence[NDArray], results: Sequence[NDArray], block: slice
     ) -> None:
-        """Rows of `blocks` of `results` (n, rows, columns), all of one type: registers are as long
-        as a block, so that they stay in cache.  What is the same in all rows is one number."""
-        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
+        """A block's rows of `results` (n, rows, columns), all of one type: registers are as long as
+        it, so that they stay in cache.  What is the same in all rows is one number."""
         held: list[Any] = [None] * self._function.sz_w()
-        for block in blocks:
-            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
-            outputs = [np.zeros((f.shape[1], block.stop - block.start), f.dtype) for f in flat]
-            for kind, what, out, a, b in self._by_numpy:
-                if kind == BINARY_OP:
-                    held[out] = what(held[a], held[b])
-                elif kind == UNARY_OP:
-                    held[out] = what(held[a])
-                elif kind == READ:
-                    held[out] = given[a][b]
-                elif kind == CONSTANT:
-                    held[out] = what
-                else:
-                    outputs[a][b] = held[out]
-            for f, output in zip(flat, outputs, strict=True):
-                f[block] = output.T
+        given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
+        flat = [r.reshape(len(r), r.shape[1] * r.shape[2])[block].T for r in results]
+        for kind, what, out, a, b in self._by_numpy:
+            if kind == BINARY_OP:
+                held[out] = what(held[a], held[b])
+            elif kind == UNARY_OP:
+                held[out] = what(held[a])
+            elif kind == READ:
+                held[out] = given[a][b]
+            elif kind == CONSTANT:
+                held[out] = what
+            else:
+                flat[a][b] = held[out]
