@@ -89,7 +89,7 @@ def known_instructions() -> Iterator[None]:
     def remembered(function: Any) -> Any:
         key = function.serialize()
         if key not in known:
-            known[key] = ask(function)
+            known[key] = [*ask(function)]
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -171,7 +171,7 @@ def _nearest(
     q, good = found.q[k], found.reached[k]
     if near is None or not good.any():
         return q[0], bool(good[0])
-    q = rigid.unwound(chain, q[good], near, task.lower, task.upper)
+    q = task.unwound(q[good], near)
     q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
     if chain.n_joints > (6 if task.oriented else 3):  # joints leave a choice
         q = task.nearest(q, np.array([place]), near)
@@ -498,7 +498,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         )
     known = np.isin(arm.model.names, arm.determined)
     for group in smooth_groups(arm.model):
-        if group.basis is None or group.whole_turn or not known[group.columns].any():
+        if not group.follows or group.whole_turn or not known[group.columns].any():
             continue
         angle = c.q[:, group.joint]
         out = reached & ((angle < group.low) | (angle > group.high))

@@ -5,7 +5,6 @@ With the worked example: the KR 270 of Klimchik et al. 2013, simulated and ident
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -81,8 +80,7 @@ def _usual(model: Model, p: Parameter) -> float:
     if chain.kinds[i] != "revolute" or not statics.weight_torque(chain, i) > 0:
         return 0.0
     rated = statics.usual_over_stated_mass(chain) * (statics.rated_torque(chain, cell, i) or 0.0)
-    lever = sum(float(np.linalg.norm(T[:3, 3])) for T in chain.link_ends[i:])
-    lever += float(np.linalg.norm(cell.tool.load_point))
+    lever = sum(chain.lengths[i:]) + float(np.linalg.norm(cell.tool.load_point))
     return statics.RATED_WIND_UP / max(rated, _largest_load(cell) * lever / OF_RATED)
 
 
@@ -302,21 +300,22 @@ def _copy_example(folder: Path) -> None:
 
 def reading_sigma(folder: Path) -> np.ndarray:
     """Standard deviation (configurations, 3) in m of one reading, from Table 1."""
-    table = np.genfromtxt(folder / "table1_noise.csv", delimiter=",", names=True)
+    table = _table(folder, "table1_noise.csv")
     deflection = np.column_stack([table[f"sigma_{a}_um"] for a in "xyz"])
     return deflection * 1e-6 / np.sqrt(2)
 
 
 def published_compliances(folder: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
     """True values in rad/(N m), and the published OLS value with its ±3σ, by parameter name."""
-    truth = {"joint1.compliance": UNSEEN_COMPLIANCE}
-    published = {}
-    with open(folder / MARK, newline="", encoding="utf-8") as handle:
-        for row in csv.DictReader(handle):
-            joint, level = row["parameter"][1], row["parameter"][2:]
-            name = f"joint{joint}.compliance" + (f"_level{level}" if level else "")
-            wls, *ols = (
-                float(row[f"{key}_urad_per_Nm"]) * 1e-6 for key in ("wls", "ols", "ols_ci3sigma")
-            )
-            truth[name], published[name] = wls, (ols[0], ols[1])
+    truth, published = {"joint1.compliance": UNSEEN_COMPLIANCE}, {}
+    for row in _table(folder, MARK):
+        joint, level = row["parameter"][1], row["parameter"][2:]
+        name = f"joint{joint}.compliance" + (f"_level{level}" if level else "")
+        keys = (f"{key}_urad_per_Nm" for key in ("wls", "ols", "ols_ci3sigma"))
+        truth[name], *ols = (float(row[key]) * 1e-6 for key in keys)
+        published[name] = ols[0], ols[1]
     return truth, published
+
+
+def _table(folder: Path, name: str) -> np.ndarray:
+    return np.genfromtxt(folder / name, delimiter=",", names=True, dtype=None, encoding="utf-8")

@@ -288,11 +288,11 @@ class _Writing:
         covariance = np.zeros((len(arm.x), len(arm.x)))
         covariance[np.ix_(at, at)] = arm.covariance
         for group in smooth_groups(arm.model):
-            if group.basis is None or not np.isin(group.columns, at).any():
+            if not group.follows or not np.isin(group.columns, at).any():
                 continue
             steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
-            x = group.grid(min(max(steps + 1, FEWEST), MOST))
-            waves = group.basis(x)
+            x = np.linspace(group.low, group.high, min(max(steps + 1, FEWEST), MOST))
+            waves = group.waves.at(x)
             for number, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
                 own = covariance[np.ix_(columns, columns)]
                 variance = np.einsum("nk,kl,nl->n", waves, own, waves)

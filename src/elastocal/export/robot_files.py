@@ -469,10 +469,10 @@ class MujocoRest:
         if arm is None:
             return self.sites(q, force, ["flange", *(f"marker_{name}" for name in pieces.markers)])
         R = arm.tree.placed(arm.base)[:3, :3] @ pieces.T_tracker_base[:3, :3].T
-        load, flange = pieces.load_scale * R @ force, arm.flange_body
+        load, (flange, place) = pieces.load_scale * R @ force, arm.flange_at
 
         def placed(points: Array) -> Array:
-            T = transform(data.xpos[flange], data.xquat[flange]) @ arm.flange_in_body
+            T = transform(data.xpos[flange], data.xquat[flange]) @ place
             return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
         def applied() -> Array:
@@ -672,11 +672,11 @@ class _MjcfText(XmlFile):
     def correct_flange(self, frames: bool) -> list[str]:
         arm, pieces = self.arm, self.pieces
         error = pieces.error(pieces.chain.n_joints - 1)
-        body, told, T = arm.flange_body, [], np.eye(4)
+        (body, at), told, T = arm.flange_at, [], np.eye(4)
         sites = {tag.get("name"): tag for tag in self.bodies[body].all("site")}
         placed: dict[str, Array] = {}
         if arm.flange in arm.tree.frames:  # a site
-            T = arm.flange_in_body @ error
+            T = at @ error
             placed = {} if nothing(error) else {arm.flange: T}
             if placed and arm.flange not in sites:
                 raise NotInPlace(f"site '{arm.flange}' stands in a <frame>")

@@ -502,7 +502,7 @@ class _Search:
                 group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),
                 x[group.columns], np.zeros((group.columns.size,) * 2),
                 np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
-                if group.basis else np.zeros(0),
+                if group.follows else np.zeros(0),
             ).refitted(x, fit.found.columns, covariance)
             for g, group in enumerate(f.groups)
         )  # fmt: skip

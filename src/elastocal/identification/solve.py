@@ -621,11 +621,10 @@ class SmoothPart:
         function without what offsets, lengths and tilts of the arm can stand for, the 95 % interval
         of that, and the rms half width of its 95 % band.  Of parameters that are no function of one
         quantity, the root of their sum of squares."""
-        basis = self.group.basis
         found = {}
         for unit in dict.fromkeys(self.group.units):
             own = [c for c, u in enumerate(self.group.units) if u == unit]
-            if basis is None:
+            if not self.group.follows:
                 waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
             else:
                 places = np.sort(self.places)
@@ -634,7 +633,7 @@ class SmoothPart:
                 x = places[even]
                 of_the_arm = (np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],)
                 Q, _ = np.linalg.qr(np.column_stack([np.ones(len(x)), *of_the_arm]))
-                waves = basis(x)
+                waves = self.group.waves.at(x)
                 waves = waves - Q @ (Q.T @ waves)
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
@@ -646,7 +645,7 @@ class SmoothPart:
                 drawn = rng.normal(size=(DRAWS, k)) @ drawing_root(covariance).T @ waves.T
                 total += ((m + drawn) ** 2).mean(axis=1)
                 spread += float(((waves @ covariance) * waves).sum(axis=1).mean())
-            rms = np.sqrt(total / (1 if basis is None else len(own)))
+            rms = np.sqrt(total / (len(own) if self.group.follows else 1))
             low, high = np.quantile(rms, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
             half = float(t_quantile(LEVEL, np.array(np.inf))) * np.sqrt(spread / len(own))
             found[unit] = (float(np.median(rms)), (float(low), float(high)), float(half))

@@ -22,7 +22,7 @@ from elastocal.cell_tables import SOURCES, Convention, Robot
 from elastocal.config import toml_key, toml_value
 from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
-from elastocal.model.chain import Chain, clashing, extent, jaw_told, names_told
+from elastocal.model.chain import Chain, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometry, MarkerPosition
 from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
@@ -192,7 +192,7 @@ FEW_KINDS = 3  # links of each mass, on average, from which on nobody has weighe
 def placeholder_masses(chain: Chain) -> str:
     """Many links of one mass, or all together far from what an arm of that length weighs, or a
     centre farther from its joint than the arm is long; "" where nothing speaks against them."""
-    length, far = extent(chain), [float(np.linalg.norm(body.com)) for body in chain.masses]
+    length, far = sum(chain.lengths), [float(np.linalg.norm(body.com)) for body in chain.masses]
     if max(far, default=0.0) > length and "prismatic" not in chain.kinds:
         return (
             f"the file has the centre of mass of link {far.index(max(far)) + 1} {max(far):.3g} m "

@@ -590,6 +590,6 @@ class CalibratedTool:
         no part of the frames."""
         x = self.x.copy()
         for group in smooth_groups(self.calibrated.model):
-            if group.basis is not None and group.lasting:
+            if group.follows and group.lasting:
                 x[group.columns] = 0.0
         return self._frames(*rows, x)

@@ -66,6 +66,11 @@ class Chain:
         return [*(joint.placement for joint in self.joints[1:]), self.flange_placement]
 
     @property
+    def lengths(self) -> list[float]:
+        """Per link from its joint's frame to its distal one, in m."""
+        return [float(np.linalg.norm(T[:3, 3])) for T in self.link_ends]
+
+    @property
     def kinds(self) -> tuple[JointKind, ...]:
         return tuple(joint.kind for joint in self.joints)
 
@@ -187,7 +192,7 @@ def plausible(chain: Chain, source: object) -> Chain:
         length = float(np.linalg.norm(T[:3, 3]))
         told = f"{source}: {length:g} m before {place} is too long for a link; correct it"
         require(length <= MAX_LENGTH, f"{told}, or if lengths are in mm, state them in m")
-    whole = extent(chain)
+    whole = sum(chain.lengths)
     for good, size, meant in (
         (whole <= MAX_LENGTH, f"{whole:g} m",
          "millimetres, state them in m (DH table: d_mm, a_mm)"),
@@ -225,11 +230,6 @@ def jaw_told(chain: Chain, moved: str = "") -> list[str]:
         f"the last joint '{last.name}' looks like a jaw of a gripper; if it is, name what carries "
         "it as flange"
     ]
-
-
-def extent(chain: Chain) -> float:
-    """Length in m from joint to joint and on to the flange."""
-    return float(sum(np.linalg.norm(T[:3, 3]) for T in chain.link_ends))
 
 
 def near_the_arm(chain: Chain) -> Chain:
@@ -325,14 +325,11 @@ def names_told(chain: Chain) -> str:
 def _meanings(chain: Chain, meant: str | None) -> tuple[dict[str, str], list[str]]:
     """What a joint may be called → jointN, and the names of which one must say what is `meant`."""
     by_file = {name: number for number, name in file_names(chain).items()}
-    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
-    clash = clashing(chain)
-    if meant == "order":
-        return by_file | by_order, []
+    clash = [] if meant == "order" else clashing(chain)
     if clash:  # by the file: a number that is no name there means nothing
         same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
         return same | by_file, clash if meant is None else []
-    return by_order | by_file, []
+    return by_file | {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}, []
 
 
 def numbered(cell: Cell, chain: Chain) -> Cell:

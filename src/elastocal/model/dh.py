@@ -28,7 +28,6 @@ from elastocal.model.chain import (
     JointKind,
     LinkMass,
     check_angles,
-    extent,
     near_the_arm,
 )
 from elastocal.model.rigid import nominal_flanges
@@ -126,7 +125,7 @@ def read_dh(
         after.append(T_after)
     masses = () if masses_path is None else _masses(Path(masses_path), names, after)
     chain = Chain(path.stem, tuple(joints), passed, masses)
-    return _closer(table, chain) if extent(chain) > MAX_LENGTH else chain
+    return _closer(table, chain) if sum(chain.lengths) > MAX_LENGTH else chain
 
 
 def read_dh_table(path: Path) -> RawTable:
@@ -188,14 +187,15 @@ def _too_much(table: RawTable, i: int, column: Column, value: float, wrong: str)
 
 def _closer(table: RawTable, chain: Chain) -> Chain:
     closer = near_the_arm(chain)
+    whole = sum(closer.lengths)
     d = np.array([dh_number(table, i, "length", "d") for i in range(len(table.row))])
     i, column = int(np.argmax(np.abs(d))), table.column("length", "d")
-    if extent(closer) > MAX_LENGTH and column is not None:
+    if whole > MAX_LENGTH and column is not None:
         raise _too_much(table, i, column, d[i], "m is too long for a link, and the d do not cancel")
     told = (
         f"the d of nearly parallel axes, up to {rounded(abs(d[i]), 4)} m, cancel: joint frames are "
-        f"taken where the axes pass the arm, whose links are {extent(closer):.2f} m long together; "
-        "it moves as the table says"
+        f"taken where the axes pass the arm, whose links are {whole:.2f} m long together; it moves "
+        "as the table says"
     )
     return replace(closer, notes=(*closer.notes, told))
 

@@ -62,17 +62,10 @@ CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
 LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
 
 
-def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
-    """`_steps` of a function as five lists, and its number of registers: those that CasADi gave the
-    instructions, of which few are in use at a time.  NotImplementedError for a CasADi operation
-    that numpy has no counterpart for.  Not a tuple for every step: thousands of these would have
-    Python look for garbage in all that is loaded, 0.07 s each time."""
-    return tuple([*column] for column in zip(*_steps(function), strict=True)), int(function.sz_w())
-
-
-def _steps(f: ca.Function) -> Iterator[tuple[int, Any, int, int, int]]:
+def instructions(f: ca.Function) -> Iterator[tuple[int, Any, int, int, int]]:
     """Kind, operation or constant, register, first and second operand of each instruction: of READ
-    input and component, of WRITE output and place row by row."""
+    input and component, of WRITE output and place row by row.  NotImplementedError for a CasADi
+    operation that numpy has no counterpart for."""
     # Where each nonzero of an output, in CasADi's order, stands in its matrix written row by row.
     outputs = [f.sparsity_out(k) for k in range(f.n_out())]
     places = [
@@ -180,8 +173,8 @@ class BatchFunction:
     def __init__(
         self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
     ) -> None:
-        self._most = FEW_ONCE if backend == ONCE else FEW
-        self._asked = None if backend is None or backend == ONCE else checked(backend, "backend")
+        by_casadi = chosen_backend(None if backend == ONCE else backend) == "auto"
+        self._most = (FEW_ONCE if backend == ONCE else FEW) * by_casadi  # rows of a block
         self._function = f = ca.Function("rows", list(inputs), list(outputs))
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
@@ -191,8 +184,8 @@ class BatchFunction:
         return {key: value for key, value in self.__dict__.items() if key != "_by_numpy"}
 
     @cached_property
-    def _by_numpy(self) -> tuple[tuple[list[Any], ...], int]:
-        return instructions(self._function)
+    def _by_numpy(self) -> list[tuple[int, Any, int, int, int]]:
+        return [*instructions(self._function)]
 
     def __call__(self, *inputs: NDArray, chunk: int = CHUNK) -> list[NDArray]:
         arrays = [np.asarray(a) for a in inputs]
@@ -204,8 +197,7 @@ class BatchFunction:
             raise ValueError(f"inputs of shapes {shapes}; it takes {sizes} per row")
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
-        few = n <= self._most * -(-n // max(chunk, 1)) and dtype == np.float64
-        if few and chosen_backend(self._asked) == "auto":
+        if n <= self._most * -(-n // max(chunk, 1)) and dtype == np.float64:
             # It takes rows side by side, and what is the same in all of them once.
             found = self._function.call([ca.DM(a.T if a.ndim == 2 else a) for a in arrays])
             for result, value in zip(results, found, strict=True):
@@ -213,40 +205,33 @@ class BatchFunction:
                     side_by_side = value.full().reshape(result.shape[1], -1, result.shape[2])
                     result[:] = side_by_side.transpose(1, 0, 2)
             return results
-        width = self._by_numpy[1] + sum(r * c for r, c in self.shapes)
+        # CasADi gave the instructions registers, of which few are in use at a time.
+        width = self._function.sz_w() + sum(r * c for r, c in self.shapes)
         blocks = row_blocks(n, min(chunk, max(LARGEST_BUFFER // max(width, 1), 1)))
         # In a thread of the caller's own one: who started it has shared the work out already.
         alone = threading.current_thread() is not threading.main_thread()
         threads = 1 if alone else max(1, min(len(blocks), thread_count()))
-        # Every thread runs in a copy of the caller's context, which holds `numpy.errstate`.
-        shares = (
-            (contextvars.copy_context(), blocks[share])
-            for share in row_blocks(len(blocks), -(-len(blocks) // threads))
-        )
-        list(ahead(lambda s: s[0].run(self._carry_out, arrays, results, s[1]), shares, threads))
+        # Each runs in a copy of the caller's context, which holds `numpy.errstate`.
+        work = ((contextvars.copy_context(), block) for block in blocks)
+        list(ahead(lambda w: w[0].run(self._carry_out, arrays, results, w[1]), work, threads))
         return results
 
     def _carry_out(
-        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
+        self, inputs: Sequence[NDArray], results: Sequence[NDArray], block: slice
     ) -> None:
-        """Rows of `blocks` of `results` (n, rows, columns), all of one type: registers are as long
-        as a block, so that they stay in cache.  What is the same in all rows is one number."""
-        steps, registers = self._by_numpy
-        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
-        held: list[Any] = [None] * registers
-        for block in blocks:
-            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
-            outputs = [np.zeros((f.shape[1], block.stop - block.start), f.dtype) for f in flat]
-            for kind, what, out, a, b in zip(*steps, strict=True):
-                if kind == BINARY_OP:
-                    held[out] = what(held[a], held[b])
-                elif kind == UNARY_OP:
-                    held[out] = what(held[a])
-                elif kind == READ:
-                    held[out] = given[a][b]
-                elif kind == CONSTANT:
-                    held[out] = what
-                else:
-                    outputs[a][b] = held[out]
-            for f, output in zip(flat, outputs, strict=True):
-                f[block] = output.T
+        """A block's rows of `results` (n, rows, columns), all of one type: registers are as long as
+        it, so that they stay in cache.  What is the same in all rows is one number."""
+        held: list[Any] = [None] * self._function.sz_w()
+        given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
+        flat = [r.reshape(len(r), r.shape[1] * r.shape[2])[block].T for r in results]
+        for kind, what, out, a, b in self._by_numpy:
+            if kind == BINARY_OP:
+                held[out] = what(held[a], held[b])
+            elif kind == UNARY_OP:
+                held[out] = what(held[a])
+            elif kind == READ:
+                held[out] = given[a][b]
+            elif kind == CONSTANT:
+                held[out] = what
+            else:
+                flat[a][b] = held[out]

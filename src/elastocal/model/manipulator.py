@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +24,13 @@ from elastocal.model.effects.base import (
     Effect,
     JointMotion,
     Parameter,
-    SmoothFunction,
     given_force,
     index,
     row_inputs,
 )
 from elastocal.model.effects.catalogue import BUILT_IN, CATALOGUE, SymbolicArm, cell_of, effect_of
 from elastocal.model.effects.geometry import DistanceSensor
+from elastocal.model.effects.smooth import SmoothFunction
 from elastocal.model.evaluate import CHUNK, chosen_backend, row_blocks, thread_count
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
@@ -52,9 +52,6 @@ class Regression:
     def residual(self) -> Array:
         """Observed minus predicted (rows,)."""
         return self.observations.value - self.prediction
-
-
-KEPT = 2**22  # numbers of B that a model keeps at most
 
 
 class Model(ByValue):
@@ -139,7 +136,6 @@ class Model(ByValue):
         self.observe = cell.model.observe
         self.symbolic = SymbolicArm(chain, cell, extra, backend)  # its expressions
         self.parameters: tuple[Parameter, ...] = self.symbolic.parameters
-        self._kept: tuple[Any, Regression] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by what it is made of; another process derives the functions again."""
@@ -448,18 +444,6 @@ class Model(ByValue):
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
 
-    def kept_regressor(self, observed: Observations, x: Array, columns: NDArray) -> Regression:
-        """`regressor` of these readings, and what it found until others are asked for: where a fit
-        ends its weights begin, its held-out residuals and its faulty readings."""
-        asked, kept = (x.tobytes(), columns.tobytes()), self._kept
-        if kept is not None and kept[0] == asked and kept[1].observations is observed:
-            return kept[1]
-        found = self.regressor(observed.table, x, columns, observed)
-        found.B.flags.writeable = found.prediction.flags.writeable = False
-        if found.B.size <= KEPT:
-            self._kept = asked, found
-        return found
-
     def flange_poses(self, table: Measurements, x: Array | None = None) -> NDArray:
         """T_tracker_flange (n_rows, 4, 4) at parameter values x, deflections included."""
         return self._frames(table, x)[0]
@@ -529,7 +513,7 @@ class SmoothGroup(SmoothFunction):
     """Shrunk parameters that have one scale: those of a smooth function, or of an effect's place.
 
     `columns` (components, waves) index the model's parameters.  Where these are no function of one
-    quantity, `follows` is "", length and range are NaN, and `basis` None.
+    quantity, `follows` is "", and length and range are NaN.
     """
 
     effect: str
@@ -546,28 +530,21 @@ class SmoothGroup(SmoothFunction):
     def joint(self) -> int:
         return index(self.follows)
 
-    def grid(self, n: int) -> Array:
-        """n values (n,) of what it follows, over its range."""
-        return np.linspace(self.low, self.high, n)
-
 
 def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:
-    place = {name: k for k, name in enumerate(model.names)}
     found: list[SmoothGroup] = []
-    shrunk = [p for p in model.parameters if p.shrunk]
-    for effect, where in dict.fromkeys((p.effect, p.where) for p in shrunk):
-        functions = list(effect_of(effect).functions(where, model.chain, model.cell))
-        taken = {f"{where}.{key}" for f in functions for keys in f.keys for key in keys}
-        own = [p for p in shrunk if (p.effect, p.where) == (effect, where)]
-        rest = [p for p in own if p.name not in taken]
-        for unit in dict.fromkeys(p.unit for p in rest):
-            alike = [p for p in rest if p.unit == unit]
-            size = float(np.sqrt(sum((p.typical or 0.0) ** 2 for p in alike)))
-            keys = tuple(p.name.removeprefix(f"{where}.") for p in alike)
-            functions.append(SmoothFunction("", (keys,), (unit,), size))
-        for f in functions:
-            columns = np.array([[place[f"{where}.{key}"] for key in keys] for keys in f.keys])
-            found.append(SmoothGroup(**vars(f), effect=effect, where=where, columns=columns))
+    shrunk = [(k, p) for k, p in enumerate(model.parameters) if p.shrunk]
+    for effect, where in dict.fromkeys((p.effect, p.where) for _, p in shrunk):
+        group = partial(SmoothGroup, effect=effect, where=where)
+        rest = {p.name: (k, p) for k, p in shrunk if (p.effect, p.where) == (effect, where)}
+        for f in effect_of(effect).functions(where, model.chain, model.cell):
+            columns = [[rest.pop(f"{where}.{key}")[0] for key in keys] for keys in f.keys]
+            found.append(group(**vars(f), columns=np.array(columns)))
+        for unit in dict.fromkeys(p.unit for _, p in rest.values()):
+            alike = [(k, p) for k, p in rest.values() if p.unit == unit]
+            size = float(np.sqrt(sum((p.typical or 0.0) ** 2 for _, p in alike)))
+            columns = [[k for k, _ in alike]]
+            found.append(group("", (), (unit,), size, columns=np.array(columns)))
     return tuple(found)
 
 
@@ -579,7 +556,7 @@ def where_smooth_functions_end(cell: Cell) -> str:
         return ""  # the robot need not be read
     ends: dict[str, tuple[float, float]] = {}
     for group in smooth_groups(Model(cell, plugins=None)):
-        if group.basis is not None and not group.whole_turn:
+        if group.follows and not group.whole_turn:
             low, high = ends.get(group.follows, (group.low, group.high))
             ends[group.follows] = min(low, group.low), max(high, group.high)
     return ", ".join(

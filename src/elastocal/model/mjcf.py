@@ -113,12 +113,10 @@ class MjcfArm:
         return self.tree.carriers(self.moving)
 
     @property
-    def flange_body(self) -> int:
-        return self.bodies.index(self.tree.link_of(self.flange)[0])
-
-    @property
-    def flange_in_body(self) -> Array:
-        return self.tree.link_of(self.flange)[1]
+    def flange_at(self) -> tuple[int, Array]:
+        """The number of the body that carries the flange, and its place (4, 4) there."""
+        link, T = self.tree.link_of(self.flange)
+        return self.bodies.index(link), T
 
     def pulling(self, file: XmlFile) -> list[str]:
         """Tendons of a file that are springs from one link of the arm, or its base, to another."""
@@ -138,8 +136,8 @@ class MjcfArm:
     @cached_property
     def chain(self) -> Chain:
         found = self.tree.chain(self.base, self.flange)
-        way = self.tree.joints_between(self.base, self.flange) or ()
-        if any(self.bodies[b] in {joint.child for joint in way} for b in self.unweighed):
+        way = {joint.child for joint in self.tree.joints_between(self.base, self.flange)}
+        if any(self.bodies[b] in way for b in self.unweighed):
             found = replace(found, masses=())
         told = self._weights_told() if found.masses else ()
         return replace(found, notes=(*self.told, *told))

@@ -105,10 +105,6 @@ def rows_needed(observed: Observations, chosen: BoolArray | IntArray | slice) ->
 def subset(observed: Observations, chosen: BoolArray | IntArray | slice) -> Observations:
     """Of those that hold (N,), or of these numbers, which ascend."""
     value = observed.value.reshape(-1, observed.size)[chosen].ravel()
-    if observed.kind != "deflection":  # each is of its own row: nothing to look for in the table
-        table = observed.table.take(chosen)
-        own = sparse.eye_array(len(table), format="csr")
-        return Observations(observed.kind, value, own, np.arange(len(table)), table)
     rows = rows_needed(observed, chosen)
     lead, own = np.searchsorted(rows, observed.lead[chosen]), observed.combine[chosen][:, rows]
     return Observations(observed.kind, value, own, lead, observed.table.take(rows))

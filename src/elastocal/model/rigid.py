@@ -8,7 +8,6 @@ Expressions take and return CasADi `SX` (or numbers, which CasADi promotes): hom
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -22,14 +21,6 @@ from elastocal.units import Array, IntArray
 # Added under square roots so that rotation-vector formulas are smooth at zero;
 # far below the rounding of any angle met in practice (1e-15 rad).
 TINY = 1e-30
-
-
-@lru_cache(maxsize=64)
-def _rodrigues(axis: tuple[float, float, float]) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """a aᵀ, 1 − a aᵀ and skew(a): an arm turns about the same few axes in every model of it."""
-    a = np.array(axis)
-    along = np.outer(a, a)
-    return constant(along), constant(np.eye(3) - along), constant(ca.skew(ca.DM(a)))
 
 
 def rotation_from_vector(r: Any) -> ca.SX:
@@ -78,10 +69,12 @@ def constant(T: Any) -> ca.SX:
 
 def joint_motion(kind: str, axis: Any, value: Any) -> ca.SX:
     """Motion of a revolute or prismatic joint by `value` (rad or m) along its unit axis."""
-    if kind == "revolute":
-        along, across, about = _rodrigues(tuple(map(float, axis)))
-        return transform(rotation=along + ca.cos(value) * across + ca.sin(value) * about)
-    return transform(translation=ca.SX(ca.DM(np.asarray(axis, dtype=float))) * value)
+    a = np.asarray(axis, dtype=float)
+    if kind == "prismatic":
+        return transform(translation=ca.SX(ca.DM(a)) * value)
+    along, about = np.outer(a, a), constant(ca.skew(ca.DM(a)))
+    turned = constant(along) + ca.cos(value) * constant(np.eye(3) - along) + ca.sin(value) * about
+    return transform(rotation=turned)
 
 
 def moved(kind: str, axis: Any, value: float) -> Array:
@@ -244,6 +237,7 @@ class Reaching(BoundedSearch):
         T_data_base: Array | None, lower: Array, upper: Array,
     ) -> None:  # fmt: skip
         super().__init__(lower, upper)
+        self.turning = chain.turning
         self.goal = np.clip(position, -FARTHEST, FARTHEST)
         q = ca.SX.sym("q", chain.n_joints)
         base = constant(np.eye(4) if T_data_base is None else T_data_base)
@@ -262,6 +256,15 @@ class Reaching(BoundedSearch):
     def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
         value, J = self._evaluate(q)
         return value[..., 0] - self.goal[target], J
+
+    def unwound(self, q: Array, near: Array) -> Array:
+        """The same postures with revolute joints turned back by whole turns, as near as allowed."""
+        turn = 2 * np.pi
+        turns = np.where(self.turning, np.round((near - q) / turn), 0.0)
+        # Rounded inwards a little less, so that a joint at its limit stays where it is.
+        fewest = np.ceil((self.lower - q) / turn - 1e-12)
+        most = np.floor((self.upper - q) / turn + 1e-12)
+        return np.clip(q + turn * np.clip(turns, fewest, most), self.lower, self.upper)
 
     def errors(self, q: Array, target: IntArray) -> tuple[Array, Array]:
         """Distance in m and angle in rad (R,) from the targets."""
@@ -351,7 +354,7 @@ def inverse_kinematics(
     starts[0] = np.vstack([near, starts[0]])
     size = max(BLOCK // postures, 1)
     blocks = [
-        _postures(chain, task, np.arange(first, min(first + size, len(position))), starts, near)
+        _postures(task, np.arange(first, min(first + size, len(position))), starts, near)
         for first in range(0, len(position), size)
     ]
     q = np.concatenate(blocks)
@@ -360,18 +363,15 @@ def inverse_kinematics(
     return Postures(q, miss.reshape(-1, postures), turn.reshape(-1, postures))
 
 
-def _postures(
-    chain: Chain, task: Reaching, targets: IntArray, starts: list[Array], near: Array
-) -> Array:
+def _postures(task: Reaching, targets: IntArray, starts: list[Array], near: Array) -> Array:
     T, K, n = len(targets), len(starts[-1]) // ROUNDS[-1], len(near)
     q, cost = np.zeros((T, K, n)), np.full((T, K), np.inf)
     left = np.arange(T)
     for some in starts:
-        found, value = task.solve(
-            np.tile(some, (len(left), 1)), np.repeat(targets[left], len(some))
-        )
-        found = unwound(chain, found, near, task.lower, task.upper)
-        found = np.concatenate([q[left], found.reshape(len(left), -1, n)], axis=1)
+        every, of = np.tile(some, (len(left), 1)), np.repeat(targets[left], len(some))
+        found, value = task.solve(every, of)
+        found = task.unwound(found, near).reshape(len(left), -1, n)
+        found = np.concatenate([q[left], found], axis=1)
         value = np.concatenate([cost[left], value.reshape(len(left), -1)], axis=1)
         order = _best_first(value, found, near)[:, :K]
         q[left] = np.take_along_axis(found, order[:, :, None], axis=1)
@@ -390,13 +390,3 @@ def _best_first(cost: Array, q: Array, near: Array) -> IntArray:
     reached = cost <= REACHED
     distance = np.linalg.norm(q - near, axis=2)
     return np.lexsort((np.where(reached, distance, cost), ~reached), axis=1)
-
-
-def unwound(chain: Chain, q: Array, near: Array, lower: Array, upper: Array) -> Array:
-    """The same postures with revolute joints turned back by whole turns, as near as allowed."""
-    turn = 2 * np.pi
-    turns = np.round((near - q) / turn)
-    # Rounded inwards a little less, so that a joint at its limit stays where it is.
-    fewest, most = np.ceil((lower - q) / turn - 1e-12), np.floor((upper - q) / turn + 1e-12)
-    turns = np.where(chain.turning, turns, 0.0)
-    return np.asarray(np.clip(q + turn * np.clip(turns, fewest, most), lower, upper))

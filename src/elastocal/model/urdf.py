@@ -332,13 +332,14 @@ class Tree:
         """The link that a name stands for, and its place (4, 4) in that link's frame."""
         return (name, np.eye(4)) if name in self.links else self.frames[name]
 
-    def joints_between(self, base: str, flange: str) -> tuple[FileJoint, ...] | None:
-        link = self.link_of(flange)[0]
-        places = [*(joint.parent for joint in self.ways[link]), link]
-        return self.ways[link][places.index(base) :] if base in places else None
+    def joints_between(self, base: str, flange: str) -> tuple[FileJoint, ...]:
+        """Those on the way; none where there is no such way."""
+        way = self.ways[self.link_of(flange)[0]]
+        parents = [joint.parent for joint in way]
+        return way[parents.index(base) :] if base in parents else ()
 
     def _below(self, base: str) -> list[str]:
-        return [link for link in self.ways if self.joints_between(base, link) is not None]
+        return [link for link in self.ways if link == base or self.joints_between(base, link)]
 
     def find(self, role: str, name: str, usual: str = "") -> str:
         there = [*self.links, *(self.frames if role == "flange" else ())]
@@ -406,7 +407,7 @@ class Tree:
     def _end_of_arm(self, base: str, leaves: Sequence[str]) -> str:
         sizes = {leaf: len(self._moving(base, leaf)) for leaf in leaves}
         most = max(sizes.values())
-        ways = [[joint.child for joint in self.joints_between(base, leaf) or ()]
+        ways = [[joint.child for joint in self.joints_between(base, leaf)]
                 for leaf in leaves if sizes[leaf] == most]  # fmt: skip
         common = [link for link in ways[0] if all(link in way for way in ways)]
         if len(self._moving(base, common[-1])) == most and len(ways) > 1:
@@ -427,18 +428,18 @@ class Tree:
         return common[-1]
 
     def _moving(self, base: str, flange: str) -> list[FileJoint]:
-        return [j for j in self.joints_between(base, flange) or () if j.moves]
+        return [j for j in self.joints_between(base, flange) if j.moves]
 
     def placed(self, link: str) -> Array:
         return reduce(np.matmul, (joint.held for joint in self.ways[link]), np.eye(4))
 
     def serial_chain(self, base: str, flange: str) -> tuple[FileJoint, ...]:
-        joints = self.joints_between(base, flange)
-        if joints is None:
-            raise InputError(
-                f"{self.path}: flange '{flange}' is not below base '{base}'; {self.parts} below "
-                f"'{base}': {listed(link for link in self._below(base) if link != base)}"
-            )
+        below, joints = self._below(base), self.joints_between(base, flange)
+        require(
+            self.link_of(flange)[0] in below,
+            f"{self.path}: flange '{flange}' is not below base '{base}'; {self.parts} below "
+            f"'{base}': {listed(link for link in below if link != base)}",
+        )
         for joint in joints:
             bounded = joint.moves and joint.kind != "continuous"
             lower, upper = joint.limit or (-math.inf, math.inf)
@@ -500,7 +501,7 @@ class Tree:
         joints, T = list[Joint](), np.eye(4)
         moments = np.zeros((len(moving), 4))  # mass times place, homogeneous
         with np.errstate(over="ignore", invalid="ignore"):  # numbers of 1e308 are judged later
-            for source in self.joints_between(base, flange) or ():
+            for source in self.joints_between(base, flange):
                 T = T @ source.origin
                 if source.moves:
                     name = source.name or f"joint{len(joints) + 1}"

@@ -3,11 +3,10 @@ chain, its expression, its traits."""
 
 from __future__ import annotations
 
-import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
@@ -19,7 +18,10 @@ from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_mo
 from elastocal.messages import InputError, listed, option, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, joint_index
-from elastocal.units import Array
+from elastocal.units import Array, pose_at
+
+if TYPE_CHECKING:
+    from elastocal.model.effects.smooth import SmoothFunction
 
 
 @dataclass(frozen=True)
@@ -106,15 +108,6 @@ def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
     return np.array([s if p.typical is None else p.typical for s, p in both])
 
 
-# The chain under construction: what effects change, and how it is put together.
-#
-#     commanded joints → transmission → links → loads → compliance → tool/markers → tracker
-#
-# All fields are CasADi expressions in the arm's inputs (what the table says of one row), its
-# parameters and the elastic deflections θ.  Positions and forces are in the data's frame
-# (tracker frame, z vertical).
-
-
 @dataclass(frozen=True, eq=False)  # a key, whatever its axis and law are made of
 class Spring:
     """One elastic degree of freedom: a small joint inserted into the chain.
@@ -138,7 +131,12 @@ class Spring:
 
 
 class Arm:
-    """Builder handed from effect to effect; `assemble` turns its pieces into positions."""
+    """The chain under construction, handed from effect to effect; `assemble` puts it together.
+
+    All fields are CasADi expressions in the arm's `inputs` (what the table says of one row), its
+    parameters and the elastic deflections θ.  Positions and forces are in the data's frame
+    (tracker frame, z vertical).
+    """
 
     def __init__(self, chain: Chain, cell: Cell) -> None:
         n = chain.n_joints
@@ -148,10 +146,8 @@ class Arm:
         self.q = [self.q_commanded[i] for i in range(n)]
         self.links = [rigid.constant(T) for T in chain.link_ends]
         nominal = cell.model.nominal
-        self.T_tracker_base = rigid.transform(
-            None if nominal.base_rotation is None else rigid.constant(nominal.base_rotation),
-            None if nominal.base_position is None else rigid.constant(nominal.base_position),
-        )
+        at = np.zeros(3) if nominal.base_position is None else nominal.base_position
+        self.T_tracker_base = rigid.constant(pose_at(at, nominal.base_rotation))
         self.markers = {name: rigid.constant(at) for name, at in cell.tool.markers.items()}
         self.load_point = rigid.constant(cell.tool.load_point)
         self.marker_rotation = {name: ca.SX.eye(3) for name in self.markers}
@@ -294,36 +290,6 @@ MOTION = "rad or m"  # unit of a parameter of a joint's motion, as the joint tur
 STIFFNESS, STATION, MARKER, OFFSET, ORDINARY, LINK = range(6)
 # Units of a motion along and about the axes of a frame.
 MOVE = ("m", "m", "m", "rad", "rad", "rad")
-
-FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
-
-
-@dataclass(frozen=True)
-class SmoothFunction:
-    """What shrunk parameters of an effect make up: a smooth function of one quantity of a row.
-
-    `follows` is a joint, "joint2", or "time"; `keys` (components, waves) are its parameters and
-    `units` (components,) those of its values.  `size` and `length` are the standard deviation and
-    the correlation length of its prior; between `low` and `high` it was measured (rad or s).
-    `basis` gives the waves (n, waves) at values (n,) of what it follows.
-    """
-
-    follows: str
-    keys: tuple[tuple[str, ...], ...]
-    units: tuple[str, ...]
-    size: float
-    length: float = math.nan
-    low: float = math.nan
-    high: float = math.nan
-    basis: Callable[[Array], Array] | None = None
-
-    @property
-    def lasting(self) -> bool:
-        return self.follows != "time"
-
-    @property
-    def whole_turn(self) -> bool:
-        return self.lasting and self.high - self.low >= FULL_TURN * 2 * math.pi
 
 
 class Effect:
@@ -558,13 +524,11 @@ class Entry(Effect):
         return len(self.units)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(
-            ParameterSpec(f"{self.name}_{k + 1}", unit, 0.0, 1e-4)
-            for k, unit in enumerate(self.units)
-        )
+        every = enumerate(self.units, start=1)
+        return tuple(ParameterSpec(f"{self.name}_{k}", unit, 0.0, 1e-4) for k, unit in every)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        self.enter(arm, place, ca.vertcat(*[p[f"{self.name}_{k + 1}"] for k in range(self.size)]))
+        self.enter(arm, place, ca.vertcat(*p.values()))
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         """Add the motion u (size,) to the chain's pieces."""

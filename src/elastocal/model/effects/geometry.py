@@ -353,8 +353,8 @@ class ThermalExpansion(WarmUp):
         return (cell.model.thermal_driver,)
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        lengths = [np.linalg.norm(T[:3, 3]) for T in chain.link_ends]
-        long = [link for link, m in zip(links(chain), lengths, strict=True) if m > SHORTEST]
+        pairs = zip(links(chain), chain.lengths, strict=True)
+        long = (link for link, length in pairs if length > SHORTEST)
         return (*long, "all")
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
@@ -584,9 +584,9 @@ def came_from(arm: Arm) -> ca.SX:
     return arm.input("direction" if ordered else "approach", arm.chain.n_joints)
 
 
-def unmoved(arm: Arm) -> ca.SX:
-    """1 (n,) where a joint has not moved yet in the campaign, else 0; 0 at all other poses."""
-    return arm.input("unmoved", arm.chain.n_joints)
+def magnitude(tau: ca.SX, scale: float) -> ca.SX:
+    """|τ|, smooth within `scale` of zero."""
+    return ca.sqrt(tau**2 + scale**2) - scale
 
 
 class Backlash(TorqueEffect):
@@ -609,14 +609,11 @@ class Backlash(TorqueEffect):
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
-        scale = torque_scale(arm.chain, arm.cell, i)
-        play = p["backlash"]
-        held: ca.SX | float = 0.0
-        if arm.cell.model.play_side == "load_and_approach":
-            held = FRICTION * scale * came_from(arm)[i]
+        scale, sided = torque_scale(arm.chain, arm.cell, i), arm.cell.model.play_side != "load"
+        held = FRICTION * scale * came_from(arm)[i] if sided else 0.0
 
         def law(tau: ca.SX) -> ca.SX:
-            return play / 2 * ca.tanh((tau - held) / scale)
+            return p["backlash"] / 2 * ca.tanh((tau - held) / scale)
 
         add_deflection(arm, i, f"{place}.backlash", law)
 
@@ -646,12 +643,11 @@ class Hysteresis(Effect):
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
-        scale = torque_scale(arm.chain, arm.cell, i)
-        direction = came_from(arm)[i]
+        scale, direction = torque_scale(arm.chain, arm.cell, i), came_from(arm)[i]
 
         def law(tau: ca.SX) -> ca.SX:
-            magnitude = ca.sqrt(tau**2 + scale**2) - scale
-            return direction * (p["hysteresis"] + p["hysteresis_per_torque"] * magnitude)
+            growth = p["hysteresis_per_torque"] * magnitude(tau, scale)
+            return direction * (p["hysteresis"] + growth)
 
         add_deflection(arm, i, f"{place}.hysteresis", law)
 
@@ -681,11 +677,11 @@ class MoveLag(DrivenEffect):
     )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        move = arm.input("move", arm.chain.n_joints)
-        own = move[index(place)]
+        i, n = index(place), arm.chain.n_joints
+        move, first = arm.input("move", n), arm.input("unmoved", n)
         longest = ca.mmax(ca.fabs(move)) + NEVER
-        moved = p["move_lag"] * own / longest + p["move_lag_sign"] * ca.sign(own)
-        return moved + p["move_lag_first"] * unmoved(arm)[index(place)]
+        moved = p["move_lag"] * move[i] / longest + p["move_lag_sign"] * ca.sign(move[i])
+        return moved + p["move_lag_first"] * first[i]
 
 
 class MoveHysteresis(DrivenEffect):
@@ -706,5 +702,6 @@ class MoveHysteresis(DrivenEffect):
     )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        side = arm.input("direction", arm.chain.n_joints)[index(place)]
-        return p["move_hysteresis"] * side + p["move_hysteresis_first"] * unmoved(arm)[index(place)]
+        i, n = index(place), arm.chain.n_joints
+        side, first = arm.input("direction", n)[i], arm.input("unmoved", n)[i]
+        return p["move_hysteresis"] * side + p["move_hysteresis_first"] * first

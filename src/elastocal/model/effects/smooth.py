@@ -29,7 +29,6 @@ the force and moment of the load; all are `shrunk`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -39,7 +38,6 @@ import numpy as np
 from elastocal.cell import Cell
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
-    FULL_TURN,
     Arm,
     BaseMotion,
     DrivenEffect,
@@ -49,7 +47,6 @@ from elastocal.model.effects.base import (
     MarkerMotion,
     ParameterSpec,
     Setting,
-    SmoothFunction,
     Spring,
     Symbols,
     index,
@@ -57,7 +54,7 @@ from elastocal.model.effects.base import (
     links,
     turning_joints,
 )
-from elastocal.model.effects.geometry import BY_ORDER, JUMP_TIME, KEYS, Jump, came_from
+from elastocal.model.effects.geometry import BY_ORDER, JUMP_TIME, KEYS, Jump, came_from, magnitude
 from elastocal.model.effects.statics import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
@@ -66,6 +63,7 @@ from elastocal.units import Array
 HIGHEST = 6.0
 MOST_WAVES = 160
 MARGIN, LENGTHS = 0.25, 3.0  # of the range, or in lengths, that the ends are apart
+FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
 
 
 @dataclass(frozen=True)
@@ -92,10 +90,6 @@ class Waves:
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
         order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
         return cls(low, np.asarray(2 * np.pi * order / period, dtype=np.float64), span, fade)
-
-    @classmethod
-    def of(cls, f: SmoothFunction) -> Waves:
-        return cls.over(f.low, f.high, f.length, f.lasting)
 
     @property
     def count(self) -> int:
@@ -132,16 +126,40 @@ class Waves:
         return np.asarray(waves(x[:, None])[0][..., 0])
 
 
-def smooth_function(
-    follows: str, components: Mapping[str, str], size: float, length: float, low: float, high: float
-) -> SmoothFunction:
-    """A function of `follows`, as its settings say: prior `size` in rad or m, `length` ℓ and range
-    in the unit of what it follows.  `components`: how the keys of each component's coefficients
-    begin → unit of its values."""
-    waves = Waves.over(low, high, length, follows != "time")
-    keys = (tuple(f"{start}_{k}" for k in range(1, waves.count + 1)) for start in components)
-    units = tuple(components.values())
-    return SmoothFunction(follows, tuple(keys), units, size, length, low, high, waves.at)
+@dataclass(frozen=True)
+class SmoothFunction:
+    """What shrunk parameters of an effect make up: a smooth function of one quantity of a row.
+
+    `follows` is a joint, "joint2", or "time", or "" where they are no function; `starts`
+    (components,) are what the keys of each component's coefficients begin with, and `units` those
+    of its values.  `size` and `length` are the standard deviation and the correlation length of its
+    prior; between `low` and `high` it was measured (rad or s).
+    """
+
+    follows: str
+    starts: tuple[str, ...]
+    units: tuple[str, ...]
+    size: float
+    length: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+    @property
+    def lasting(self) -> bool:
+        return self.follows != "time"
+
+    @property
+    def whole_turn(self) -> bool:
+        return math.isinf(self.waves.fade)
+
+    @property
+    def waves(self) -> Waves:
+        return Waves.over(self.low, self.high, self.length, self.lasting)
+
+    @property
+    def keys(self) -> list[list[str]]:
+        """Of its parameters (components, waves)."""
+        return [[f"{start}_{k + 1}" for k in range(self.waves.count)] for start in self.starts]
 
 
 class SmoothEffect(DrivenEffect):
@@ -150,20 +168,19 @@ class SmoothEffect(DrivenEffect):
     together = True
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(
-            ParameterSpec(key, unit, 0.0, sd, shrunk=True)
-            for f in self.functions(place, chain, cell)
-            for keys, unit in zip(f.keys, f.units, strict=True)
-            for key, sd in zip(
-                keys, np.sqrt(Waves.of(f).variances(f.size, f.length)).tolist(), strict=True
-            )
-        )
+        found: list[ParameterSpec] = []
+        for f in self.functions(place, chain, cell):
+            sizes = np.sqrt(f.waves.variances(f.size, f.length)).tolist()
+            for keys, unit in zip(f.keys, f.units, strict=True):
+                known = zip(keys, sizes, strict=True)
+                found += [ParameterSpec(key, unit, 0.0, sd, shrunk=True) for key, sd in known]
+        return tuple(found)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         u = ca.SX.zeros(self.entry_at(place).size)
         for f in self.functions(place, arm.chain, arm.cell):
             x = arm.q_commanded[index(f.follows)] if f.lasting else arm.input("time", 1)
-            waves = ca.vertcat(*Waves.of(f).values(x))
+            waves = ca.vertcat(*f.waves.values(x))
             every = (ca.vertcat(*(p[key] for key in keys)) for keys in f.keys)
             u += ca.vertcat(*(ca.dot(coefficients, waves) for coefficients in every))
         return u
@@ -190,8 +207,9 @@ class JointCurve(SmoothEffect):
     )
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        stated = self.stated(place, chain, cell).values()
-        return (smooth_function(place, {"curve": "rad"}, *stated),)
+        return (
+            SmoothFunction(place, ("curve",), ("rad",), *self.stated(place, chain, cell).values()),
+        )
 
 
 class AnyMotion(DrivenEffect):
@@ -217,12 +235,11 @@ class AnyMotion(DrivenEffect):
 class ResidualField(AnyMotion, SmoothEffect):
     """A place moves smoothly with joint angles or time, and nobody knows why.
 
-    u = Σ_c f_c(x_c) in every component of the motion at the place: of "jointN" its angle, of
-    "linkN" its end frame along and about its axes, of "base" the base, of "marker:NAME" the marker;
-    x_c are the joints' angles and the time.  Settings for each c, "joint2" or "time":
-    `field_c_size` (rad and m; 0, the default, where the field does not follow it), and
-    `field_c_length`, `field_c_low`, `field_c_high` in rad or s.  What a diagnosis finds and cannot
-    name: it corrects the arm where it was measured, and is no explanation.
+    u = Σ_c f_c(x_c) in every component of the motion, x_c the joints' angles and the time.
+    Settings for each c, "joint2" or "time": `field_c_size` (rad and m; 0, the default, where the
+    field does not follow it), and `field_c_length`, `field_c_low`, `field_c_high` in rad or s.
+    What a diagnosis finds and cannot name: it corrects the arm where it was measured, and is no
+    explanation.
     """
 
     name = "residual_field"
@@ -243,9 +260,10 @@ class ResidualField(AnyMotion, SmoothEffect):
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
         given, units = self.stated(place, chain, cell), self.entry_at(place).units
         return tuple(
-            smooth_function(
+            SmoothFunction(
                 name,
-                {f"field_{name}_{c}": unit for c, unit in enumerate(units, start=1)},
+                tuple(f"field_{name}_{c + 1}" for c in range(len(units))),
+                units,
                 *(given[f"field_{name}_{key}"] for key in ("size", "length", "low", "high")),
             )
             for name in (*turning_joints(chain), "time")
@@ -268,8 +286,7 @@ class ResidualField(AnyMotion, SmoothEffect):
 class ResidualStep(AnyMotion, Jump):
     """A place moves by u for t ≥ T, and nobody knows why: a knock, a clamp that slipped.
 
-    Of "jointN" its angle, of "linkN" its end frame along and about its axes, of "base" the base, of
-    "marker:NAME" the marker; u in rad and m with the prior size `step_size`, T = `step_time_s`.
+    u in rad and m with the prior size `step_size`, T = `step_time_s`.
     """
 
     name = "residual_step"
@@ -342,7 +359,7 @@ class TorqueResponse(JointResponse):
     sized_by = "torque_response_rad"
 
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
-        return ca.vertcat(u, u**3, ca.tanh(u / SHARP), _magnitude(u), u**2)
+        return ca.vertcat(u, u**3, ca.tanh(u / SHARP), magnitude(u, SHARP), u**2)
 
 
 class ApproachResponse(JointResponse):
@@ -363,11 +380,7 @@ class ApproachResponse(JointResponse):
         return () if cell.model.approach == BY_ORDER else self.needs
 
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
-        return side * ca.vertcat(1, _magnitude(u))
-
-
-def _magnitude(u: ca.SX) -> ca.SX:
-    return ca.sqrt(u**2 + SHARP**2) - SHARP
+        return side * ca.vertcat(1, magnitude(u, SHARP))
 
 
 class LoadResponse(LoadedEffect):

@@ -13,7 +13,7 @@ import numpy as np
 from elastocal.cell import Cell
 from elastocal.messages import require, rounded
 from elastocal.model import rigid
-from elastocal.model.chain import Chain, extent
+from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     SHORTEST,
     STIFFNESS,
@@ -230,7 +230,7 @@ class GravityCompensator(Effect):
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         if cell.model.nominal.gravity_compensator is not None:
             return ()
-        length = float(np.linalg.norm(chain.link_ends[index(place)][:3, 3]))
+        length = chain.lengths[index(place)]
         a = ANCHOR_SHARE * length if length > SHORTEST else ANCHOR_DEFAULT
         shapes = [NO_LENGTH]
         for share in ARMS:
@@ -365,12 +365,10 @@ WEIGHT = 30.0  # kg/m²
 HOUSING = 0.1  # m, that even the last link stands out
 
 
-def extents(chain: Chain) -> tuple[list[Array], Array]:
-    """The way (3,) in m from each joint to its link's end, and the stretched length (joints,) of
-    what follows there, a housing at least."""
-    ends = [T[:3, 3] for T in chain.link_ends]
-    lengths = np.array([np.linalg.norm(end) for end in ends])
-    return ends, np.cumsum(lengths[::-1])[::-1] - lengths + HOUSING
+def further(chain: Chain) -> Array:
+    """Stretched length (joints,) in m of what follows each link's end, a housing at least."""
+    lengths = np.array(chain.lengths)
+    return np.cumsum(lengths[::-1])[::-1] - lengths + HOUSING
 
 
 class LinkWeights(Effect):
@@ -391,25 +389,24 @@ class LinkWeights(Effect):
     sized_by = "weights_kg_per_m"
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        ends, further = extents(chain)
-        density = WEIGHT * float(np.linalg.norm(ends[0]) + further[0])
+        density = WEIGHT * float(chain.lengths[0] + further(chain)[0])
         return (Setting(self.sized_by, "range", density, 1e-9, 1e9),)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         density = self.stated(place, chain, cell)[self.sized_by]
         found: list[ParameterSpec] = []
-        described = zip(links(chain), chain.joints, *extents(chain), strict=True)
-        for link, joint, end, further in described:
-            own, across = float(np.linalg.norm(end)), np.array(transverse_axes(joint.axis))
+        each = zip(chain.link_ends, chain.lengths, further(chain).tolist(), strict=True)
+        for link, joint, (T, own, beyond) in zip(links(chain), chain.joints, each, strict=True):
+            across = np.array(transverse_axes(joint.axis))
             mass = density * (own + HOUSING)
             if joint.kind == "revolute":
-                for key, way in zip("xy", np.abs(across @ end).tolist(), strict=True):
-                    along, across_it = density * way * (own / 2 + further), mass * HOUSING
+                for key, way in zip("xy", np.abs(across @ T[:3, 3]).tolist(), strict=True):
+                    along, across_it = density * way * (own / 2 + beyond), mass * HOUSING
                     name, size = f"{link}_moment_{key}", along + across_it
                     alike = "along" if along > across_it else "across"
                     found.append(ParameterSpec(name, "kg*m", 0.0, size, shrunk=True, alike=alike))
             else:
-                size = density * (own + further)
+                size = density * (own + beyond)
                 found.append(ParameterSpec(f"{link}_mass", "kg", 0.0, size, shrunk=True))
         return tuple(found)
 
@@ -546,7 +543,7 @@ def usual_over_stated_mass(chain: Chain) -> float:
     """What the masses are to be multiplied by; 1 where an arm of this length may have them, and of
     gantries, whose travel is no length of theirs."""
     mass = sum(body.mass for body in chain.masses)
-    usual = USUAL_MASS * extent(chain) ** 3
+    usual = USUAL_MASS * sum(chain.lengths) ** 3
     alike = usual <= OF_ANY_ARM * mass and mass <= OF_ANY_ARM * usual
     gantry = chain.kinds.count("prismatic") > 1
     return 1.0 if alike or mass == 0 or gantry else usual / mass
@@ -644,10 +641,9 @@ class LinkBending(TiltingEffect):
     def axes(self, place: str, chain: Chain) -> dict[str, Array]:
         """In the frame at the distal end; torsion about the line there from the joint's frame, or
         about the joint's axis where the link has no length."""
-        T = chain.link_ends[index(place)]
-        length = np.linalg.norm(T[:3, 3])
-        along = T[:3, 3] / length if length > SHORTEST else chain.joints[index(place)].axis
-        along = T[:3, :3].T @ along
+        i = index(place)
+        T, length = chain.link_ends[i], chain.lengths[i]
+        along = T[:3, :3].T @ (T[:3, 3] / length if length > SHORTEST else chain.joints[i].axis)
         y, z = transverse_axes(along)
         return {"torsion": along, "bending_y": y, "bending_z": z}
 
