@@ -16,7 +16,7 @@ from scipy.sparse import csgraph
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import Motion
-from elastocal.messages import InputError, InsufficientDataError, rounded, some
+from elastocal.messages import InputError, InsufficientDataError, require, rounded, some
 from elastocal.model.chain import Chain, finite_ranges, joint_limits, told
 from elastocal.model.effects.catalogue import SymbolicArm
 from elastocal.model.effects.statics import GravityCompensator
@@ -33,7 +33,6 @@ from elastocal.planning.collision import (
     Sight,
     cell_bodies,
     cell_pairs,
-    incidence,
     marker_positions,
     rope_angle,
 )
@@ -283,48 +282,49 @@ def _visibility(cell: Cell) -> Iterator[Rule]:
     sight, eye = cell.workspace.visibility, cell.tracker.position
     if sight is None:
         return
-    if not cell.tool.markers:
-        raise InputError(
-            f"{cell.source}: [workspace.visibility] needs the markers; give [tool.markers_m]"
-        )
-    names, markers = tuple(cell.tool.markers), list(cell.tool.markers.values())
+    markers = cell.tool.markers
+    require(
+        bool(markers),
+        f"{cell.source}: [workspace.visibility] needs the markers; give [tool.markers_m]",
+    )
     near, far = sight.range
 
+    def to_eye(poses: Poses, names: Sequence[str]) -> Array:
+        return eye - marker_positions(poses, [markers[name] for name in names])
+
     def distance(poses: Poses) -> Array:
-        return np.asarray(np.linalg.norm(marker_positions(poses, markers) - eye, axis=2))
+        return np.asarray(np.linalg.norm(to_eye(poses, tuple(markers)), axis=2))
 
     if near > 0 or np.isfinite(far):
-        yield Bound("range", distance, near, far, names, "a range_m", ("m",))
-    observed = tuple(name for name in names if name in sight.normals)
-    if sight.max_incidence is not None and observed:
-        at = [cell.tool.markers[name] for name in observed]
-        axes = [sight.normals[name] for name in observed]
-        yield Bound(
-            "incidence", lambda p: incidence(p, at, axes, eye), 0.0, sight.max_incidence, observed,
-            "a max_incidence_deg", ("°",),
-        )  # fmt: skip
+        yield Bound("range", distance, near, far, tuple(markers), "a range_m", ("m",))
+    observed = tuple(name for name in markers if name in sight.normals)
+
+    def incidence(poses: Poses) -> Array:
+        line, normals = to_eye(poses, observed), np.array([sight.normals[n] for n in observed])
+        axes = np.einsum("nij,mj->nmi", poses.flange[:, :3, :3], normals)
+        across = np.linalg.norm(np.cross(axes, line), axis=2)
+        return np.asarray(np.arctan2(across, np.einsum("nmi,nmi->nm", axes, line)))
+
+    if (most := sight.max_incidence) is not None and observed:
+        yield Bound("incidence", incidence, 0.0, most, observed, "a max_incidence_deg", ("°",))
 
 
 def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
     load = cell.workspace.load
-    if load is not None and load.max_angle is not None and load.rope_axis is not None:
-        axis = load.rope_axis
-
-        def angle(poses: Poses) -> Array:
-            return np.where(poses.loaded, rope_angle(poses, axis), 0.0)[:, None]
-
-        label, key = ("the rope",), "a max_angle_deg"
-        yield Bound("rope_angle", angle, 0.0, load.max_angle, label, key, ("°",))
-    if cell.workspace.torque_limits:
-        bound = np.array(cell.workspace.torque_limits)
-        if len(bound) != chain.n_joints:
-            raise InputError(
-                f"{cell.source}: [workspace] torque_limits_Nm has {len(bound)} values, "
-                f"but robot '{chain.name}' has {chain.n_joints} joints"
-            )
+    if load is not None and load.max_angle is not None:
+        yield Bound(
+            "rope_angle", lambda p: rope_angle(p, load)[:, None], 0.0, load.max_angle,
+            ("the rope",), "a max_angle_deg", ("°",),
+        )  # fmt: skip
+    if bound := cell.workspace.torque_limits:
+        require(
+            len(bound) == chain.n_joints,
+            f"{cell.source}: [workspace] torque_limits_Nm has {len(bound)} values, "
+            f"but robot '{chain.name}' has {chain.n_joints} joints",
+        )
         torque = StaticTorque(cell, chain)
         yield Bound(
-            "torque", lambda p: np.abs(torque(p)), 0.0, bound, joints,
+            "torque", lambda p: np.abs(torque(p)), 0.0, np.array(bound), joints,
             "a torque_limits_Nm", ("N m",),
         )  # fmt: skip
 

@@ -472,7 +472,7 @@ class Plan(Result):
         own = tuple(self.model.cell.tool.markers)
         first, n = [row[0][1] for row in rows], len(rows)
         two = self.execution.motion.both_directions or any(stop.side for stop in first)
-        names = [stop.name(self.configurations) + ("+", "-")[stop.side] * two for stop in first]
+        names = [stop.name(self.names) + ("+", "-")[stop.side] * two for stop in first]
         labels = tuple(dict.fromkeys(names))
         approach = [stop.approach for stop in first if stop.approach is not None]
         times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
@@ -530,10 +530,6 @@ class Plan(Result):
         every, some = self.seen[k].all(axis=0), self.seen[k].any(axis=0)
         told = zip(names, every, some, strict=True)
         return " ".join(name if all_ else f"({name})" for name, all_, any_ in told if any_)
-
-    @property
-    def configurations(self) -> tuple[str, ...]:
-        return self.names
 
     @property
     def group_names(self) -> tuple[str, ...]:
@@ -598,7 +594,7 @@ class Plan(Result):
                 {
                     "configuration": k + 1,
                     "markers": self.markers(k),
-                    "name": self.configurations[k],
+                    "name": self.names[k],
                     "loads_N": self.forces[self.readings[k] > 0].tolist(),
                     "readings": int(self.readings[k].max()),
                     "value_without": None if not np.isfinite(r.loss) else r.loss,
