@@ -474,7 +474,7 @@ def _stops(moves: Moves, u: int, v: int) -> list[Stop]:
 
 
 def _time(moves: Moves, way: list[int]) -> float:
-    return float(sum(moves.times[i, j] for i, j in pairwise(way)))
+    return float(sum(moves.maps[0].times[i, j] for i, j in pairwise(way)))
 
 
 def nearest_first(cost: Array) -> list[int]:

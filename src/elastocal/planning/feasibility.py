@@ -459,11 +459,14 @@ class Roadmap:
     move counts as free until it is checked; a blocked one is replaced by the fastest way through
     other points.  So costs never exceed the true ones (Bohlin and Kavraki 2000)."""
 
-    def __init__(self, points: Array, times: Array, loaded: bool, checker: Feasibility) -> None:
+    def __init__(
+        self, points: Array, speed: Array | None, loaded: bool, checker: Feasibility
+    ) -> None:
         self.points, self.loaded, self.checker = points, loaded, checker
         self.carrying = " with the load" if loaded else ""
-        self.direct = times.copy()  # inf where blocked
-        self.checked = np.eye(len(times), dtype=bool)
+        self.times = travel_times(points, speed)
+        self.direct = self.times.copy()  # inf where blocked
+        self.checked = np.eye(len(points), dtype=bool)
 
     def check(self, moves: Iterable[tuple[int, int]]) -> bool:
         """All free?  Each move is checked once, those not checked before together."""
@@ -533,6 +536,15 @@ class Roadmap:
         free = self.checked & np.isfinite(self.direct)
         return np.asarray(csgraph.connected_components(free, directed=False)[1])
 
+    def name(self, point: int, home: int | None) -> str:
+        chain = self.checker.chain
+        joints = ", ".join(told(chain, j, value) for j, value in enumerate(self.points[point]))
+        return f"{'home' if point == home else f'pose {point + (home is None)}'} (joints {joints})"
+
+    def in_the_way(self, i: int, j: int) -> str:
+        names = self.checker.blockers(self.points[i], self.points[j], self.loaded)
+        return f" (in the way: {', '.join(names)})" if names else ""
+
 
 MOST_NAMED = 3
 
@@ -547,15 +559,14 @@ class Unreachable(InsufficientDataError):
 
 @dataclass(frozen=True)
 class Moves:
-    """Home, poses, points of approach and via points in one list, `points` (m, n), with `times` (m,
-    m) between them, the roadmaps `maps` without and with load, and V visits among them: of `pose`
-    (V,) in the load state `load` (V,), left from `leave` (V,), where the pose is.  `sides` (V, 2)
-    are the points from which it is approached, with `signs` (N, 2, n), and which of them are `free`
-    (V, 2); without approaches the pose itself."""
+    """Home, poses, points of approach and via points in one list, `points` (m, n), the roadmaps
+    `maps` between them without and with load, and V visits among them: of `pose` (V,) in the load
+    state `load` (V,), left from `leave` (V,), where the pose is.  `sides` (V, 2) are the points
+    from which it is approached, with `signs` (N, 2, n), and which of them are `free` (V, 2);
+    without approaches the pose itself."""
 
     points: Array
-    times: Array
-    maps: tuple[Roadmap, Roadmap]
+    maps: tuple[Roadmap, ...]
     loaded: BoolArray
     home: int | None
     signs: IntArray | None
@@ -583,15 +594,14 @@ class Moves:
             between = (q[:, None] - signs * motion.overshoot).reshape(-1, n)
             sides = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
         points = np.vstack([start, q, between, np.zeros((0, n)) if via is None else via])
-        times = travel_times(points, motion.speed)
-        maps = (Roadmap(points, times, False, checker), Roadmap(points, times, True, checker))
+        maps = tuple(Roadmap(points, motion.speed, loaded, checker) for loaded in (False, True))
         loaded, free = (forces != 0).any(axis=1), np.ones(sides.shape, dtype=bool)
         for roadmap in maps if signs is not None else ():
             own = loaded[load] == roadmap.loaded
             ends = np.broadcast_to(leave[own, None], sides[own].shape)
             roadmap.check(zip(sides[own].ravel().tolist(), ends.ravel().tolist(), strict=True))
             free[own] = np.isfinite(roadmap.direct[sides[own], ends])
-        return cls(points, times, maps, loaded, home, signs, pose, load, leave, sides, free)
+        return cls(points, maps, loaded, home, signs, pose, load, leave, sides, free)
 
     @cached_property
     def side(self) -> IntArray:
@@ -605,7 +615,7 @@ class Moves:
     @cached_property
     def inside(self) -> Array:
         """(V,) s from there on: the approach, and to the other side and back; inf where blocked."""
-        to = self.times[self.leave[:, None], self.sides]
+        to = self.maps[0].times[self.leave[:, None], self.sides]
         first = to[np.arange(len(to)), self.side]
         both = np.where(self.free.all(axis=1), 2 * to[:, -1], 0.0) if self.signs is not None else 0
         return np.where(self.free.any(axis=1), first + both, np.inf)
@@ -672,7 +682,7 @@ class Moves:
             roadmap, way = self.way(u, v)
             # Where no way is left, every move has been checked: nothing to be learnt.
             wanted[roadmap.loaded] += [m for m in pairwise(way) if np.isfinite(roadmap.direct[m])]
-        return not all([self.maps[k].check(wanted[k]) for k in (0, 1)])
+        return not all([roadmap.check(wanted[roadmap.loaded]) for roadmap in self.maps])
 
     def settle(self) -> None:
         """Check the ways between all visits: many at once take less time than a few again and
@@ -697,9 +707,9 @@ class Moves:
             for v in np.flatnonzero(here & ~self.free.any(axis=1)):
                 pose, (below, above) = int(self.leave[v]), self.sides[v].tolist()
                 raise Unreachable(
-                    f"{self._name(pose)} cannot be approached{roadmap.carrying}, neither from below"
-                    f"{self._in_the_way(roadmap, below, pose)} nor from above"
-                    f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
+                    f"{roadmap.name(pose, self.home)} cannot be approached{roadmap.carrying}, "
+                    f"neither from below{roadmap.in_the_way(below, pose)} nor from above"
+                    f"{roadmap.in_the_way(above, pose)}; lower overshoot_deg in "
                     "[design.motion], or raise clearance_mm in [workspace]",
                     self.pose[v],
                 )
@@ -717,11 +727,11 @@ class Moves:
                 raise self._unreachable(roadmap, every if clear else lost[0])
 
     def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
-        named = some(map(self._name, lost), MOST_NAMED)
+        named = some((roadmap.name(point, self.home) for point in lost), MOST_NAMED)
         others = np.setdiff1d(np.arange(len(self.points)), lost)
-        between = self.times[lost][:, others]
+        between = roadmap.times[lost][:, others]
         i, j = np.unravel_index(int(np.argmin(between)), between.shape)
-        by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
+        by = roadmap.in_the_way(int(others[j]), lost[int(i)])
         return Unreachable(
             f"{named} cannot be reached{roadmap.carrying} by collision-free joint moves, "
             f"neither directly nor through home and other poses{by}; give another home in "
@@ -729,25 +739,13 @@ class Moves:
             *np.unique(self.pose[np.isin(self.leave, lost)]),
         )
 
-    def _name(self, point: int) -> str:
-        chain = self.maps[0].checker.chain
-        joints = ", ".join(told(chain, j, value) for j, value in enumerate(self.points[point]))
-        if point == self.home:
-            return f"home (joints {joints})"
-        return f"pose {point + (self.home is None)} (joints {joints})"
-
-    def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
-        names = roadmap.checker.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
-        return f" (in the way: {', '.join(names)})" if names else ""
-
 
 def approach_signs(chain: Chain, q: Array, lower: Array, upper: Array, by: float) -> IntArray:
     """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first upwards
     (+1), then down (−1), so that backlash and hysteresis show; both from the same side where the
     other is beyond the limits."""
     below, above = q - by >= lower, q + by <= upper
-    if not (below | above).all():
-        i, j = (int(v) for v in np.argwhere(~(below | above))[0])
+    for i, j in np.argwhere(~(below | above)).tolist():
         raise InputError(
             f"pose {i + 1}: joint {j + 1} has no room on either side of {told(chain, j, q[i, j])} "
             f"for an overshoot of {told(chain, j, by)}; lower overshoot_deg in "
