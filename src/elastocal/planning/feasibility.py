@@ -468,7 +468,7 @@ class Roadmap:
         self.direct = self.times.copy()  # inf where blocked
         self.checked = np.eye(len(points), dtype=bool)
 
-    def check(self, moves: Iterable[tuple[int, int]]) -> bool:
+    def check(self, moves: Iterable[Sequence[int]]) -> bool:
         """All free?  Each move is checked once, those not checked before together."""
         pairs = sorted({(min(move), max(move)) for move in moves})
         new = [pair for pair in pairs if not self.checked[pair]]
@@ -505,36 +505,30 @@ class Roadmap:
             self.check(move for way in ways for move in pairwise(way))
             left = [(w[0], w[-1]) for w in ways if np.isinf(self.direct[w[:-1], w[1:]]).any()]
 
+    @property
+    def _graph(self) -> Array:
+        finite = self.direct[np.isfinite(self.direct)]
+        return self.direct + max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
+
     @cached_property
     def _shortest(self) -> tuple[Array, NDArray[np.integer]]:
-        finite = self.direct[np.isfinite(self.direct)]
-        extra = max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
-        return csgraph.shortest_path(self.direct + extra, method="FW", return_predecessors=True)
+        return csgraph.shortest_path(self._graph, method="FW", return_predecessors=True)
 
     def parts(self, needed: list[int]) -> list[list[int]]:
         """`needed` points by what free moves connect, the largest part first.  Only as many moves
-        are checked as it takes, first among `needed`, then through all points: every part tries its
-        shortest ways out, twice as many each time (Borůvka)."""
-        for among, tries in ((np.array(needed), 1), (np.arange(len(self.points)), 1)):
-            while len(set((label := self._joined())[needed])) > 1:
-                new: list[tuple[int, int]] = []
-                for part in set(label[among]):
-                    own, others = among[label[among] == part], among[label[among] != part]
-                    out = self.direct[np.ix_(own, others)]
-                    first = np.argsort(out, axis=None, kind="stable")[:tries]
-                    i, j = np.unravel_index(first[np.isfinite(out.ravel()[first])], out.shape)
-                    new += zip(own[i].tolist(), others[j].tolist(), strict=True)
-                if not new:
-                    break
-                self.check(new)
-                tries *= 2
-        found = [[p for p in needed if label[p] == part] for part in dict.fromkeys(label[needed])]
+        are checked as it takes: those of the shortest trees among `needed`, then through all
+        points, until all of one are free."""
+        for among in (np.array(needed), np.arange(len(self.points))):
+            free = False
+            while not free:
+                tree = csgraph.minimum_spanning_tree(self._graph[np.ix_(among, among)])
+                free = self.check(among[np.transpose(tree.nonzero())].tolist())
+            label = dict(zip(among, csgraph.connected_components(tree, False)[1], strict=True))
+            names = dict.fromkeys(label[point] for point in needed)
+            found = [[point for point in needed if label[point] == name] for name in names]
+            if len(found) == 1:
+                break
         return sorted(found, key=len, reverse=True)
-
-    def _joined(self) -> IntArray:
-        """A label (m,) for each part that is known to hang together."""
-        free = self.checked & np.isfinite(self.direct)
-        return np.asarray(csgraph.connected_components(free, directed=False)[1])
 
     def name(self, point: int, home: int | None) -> str:
         chain = self.checker.chain
