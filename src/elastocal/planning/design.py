@@ -45,7 +45,7 @@ from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import CRITERIA, criterion_named
-from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.feasibility import CandidateCounts, Feasibility
 from elastocal.planning.information import (
     IDENTIFIED,
     Known,
@@ -56,7 +56,6 @@ from elastocal.planning.information import (
     with_noise_of,
 )
 from elastocal.planning.plan import (
-    CandidateCounts,
     Chance,
     Gain,
     Plan,

@@ -230,6 +230,13 @@ class StaticTorque:
 
 
 @dataclass(frozen=True)
+class CandidateCounts:
+    tried: int
+    feasible: int
+    removed_by: dict[str, int]
+
+
+@dataclass(frozen=True)
 class PoseFeasibility:
     """What the `rules` (R) say of candidates `q` (N, n) under `force` (N, 3): `broken` (N, R)."""
 
@@ -243,10 +250,11 @@ class PoseFeasibility:
         return np.asarray(~self.broken.any(axis=1))
 
     @property
-    def removed_by(self) -> dict[str, int]:
-        """Candidates by the first rule they break: tried = feasible + Σ removed_by."""
+    def counts(self) -> CandidateCounts:
+        """Each by the first rule that it breaks: tried = feasible + Σ removed_by."""
         first = (self.broken & (self.broken.cumsum(axis=1) == 1)).sum(axis=0)
-        return dict(zip(self.rules, first.tolist(), strict=True))
+        removed_by = dict(zip(self.rules, first.tolist(), strict=True))
+        return CandidateCounts(len(self.q), int(self.ok.sum()), removed_by)
 
 
 # The rules that a cell states, in the order of checking: cheap ones first.
