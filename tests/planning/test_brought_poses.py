@@ -135,8 +135,8 @@ def file(tmp_path: Path) -> Path:
 
 def test_one_pose_struck_is_replaced_and_no_other_is_better(file) -> None:
     plan = ec.design(CELL, effort="quick", strike=f"{file}:3")
-    assert plan.configurations == ("1", "2", "4", "5", "6", "7")
-    kept = [k for k, name in enumerate(first().configurations) if name != "3"]
+    assert plan.names == ("1", "2", "4", "5", "6", "7")
+    kept = [k for k, name in enumerate(first().names) if name != "3"]
     assert np.allclose(plan.q[:5], first().q[kept], atol=1e-9)
     assert np.abs(plan.q[5] - first().q[2]).max() >= NEARBY
     assert first().value <= plan.value * (1 + 5e-3)

@@ -93,7 +93,7 @@ def every_pose_is_allowed_in_every_state(plan: Plan, _: Setup, rules: Feasibilit
     for k in range(len(plan.q)):
         for force in plan.forces:
             verdict = rules.check(plan.q[k], force)
-            assert verdict.ok.all(), verdict.removed_by
+            assert verdict.ok.all(), verdict.counts
 
 
 def every_reading_has_a_stop_and_every_move_is_free(

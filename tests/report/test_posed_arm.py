@@ -118,7 +118,7 @@ def plan_at(cell, q, group, group_names, names=None):
     stops = [SimpleNamespace(pose=k, again=0) for k in range(len(q))]
     return SimpleNamespace(
         model=SimpleNamespace(cell=cell, chain=kr270_chain()), q=q, group=np.asarray(group),
-        group_names=tuple(group_names), configurations=names or [str(i + 1) for i in range(len(q))],
+        group_names=tuple(group_names), names=names or [str(i + 1) for i in range(len(q))],
         level_joint=1, execution=SimpleNamespace(stops=stops),
     )  # fmt: skip
 

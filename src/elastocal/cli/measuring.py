@@ -291,7 +291,7 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
             check_six_axes(chain, LANGUAGES[path.suffix.lower()].title)
             if plan is not None:
                 written[path] = robot_program(
-                    path.suffix, plan.execution, chain, plan.configurations, plan.forces,
+                    path.suffix, plan.execution, chain, plan.names, plan.forces,
                     joint_limits(cell, chain), path.stem,
                 )  # fmt: skip
     return written

@@ -83,7 +83,6 @@ def capsule_between(name: str, a: Array, b: Array, radius: float) -> Solid:
 
 def rotation_to(z: Array) -> Array:
     """Rotations (..., 3, 3) whose third column is the unit vector z (..., 3)."""
-    z = np.asarray(z, dtype=float)
     across = np.where(np.abs(z[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     x = np.cross(across, z)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
@@ -368,12 +367,10 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     own = [body for body in bodies if body.kind != "obstacle"]
     obstacles = [body for body in bodies if body.kind == "obstacle"]
     pairs = [Pair(body, space, 0.0, "keep_out") for body in moving for space in workspace.keep_out]
-    plane = mounting_plane(cell, chain)
-    if plane is not None:
-        drawn = [*moving, *_outline(cell, chain, bodies)]
+    if (plane := mounting_plane(cell, chain)) is not None:
         # What joint 1 turns stays at its height.
-        standing = [body for body in drawn if body.carrier > 0]
-        pairs += [Pair(body, plane, 0.0, "mounting_plane") for body in standing]
+        drawn = (b for b in (*moving, *_outline(cell, chain, bodies)) if b.carrier > 0)
+        pairs += [Pair(body, plane, 0.0, "mounting_plane") for body in drawn]
     if (load := workspace.load) is not None and load.min_height is not None:
         floor = HalfSpace(FLOOR, load.min_height * UP, UP)
         pairs += [Pair(body, floor, 0.0, "load_height") for body in bodies if body.kind == "load"]
@@ -582,15 +579,6 @@ def marker_positions(poses: Poses, markers: Sequence[Array]) -> Array:
     return np.asarray(np.einsum("nij,mj->nmi", T[:, :3, :3], np.array(markers))) + T[:, None, :3, 3]
 
 
-def incidence(
-    poses: Poses, markers: Sequence[Array], normals: Sequence[Array], eye: Array
-) -> Array:
-    to_eye = eye - marker_positions(poses, markers)
-    axes = np.einsum("nij,mj->nmi", poses.flange[:, :3, :3], np.array(normals))
-    across = np.linalg.norm(np.cross(axes, to_eye), axis=2)
-    return np.asarray(np.arctan2(across, np.einsum("nmi,nmi->nm", axes, to_eye)))
-
-
 class Sight:
     """Beams from the tracker to the markers, tested as capsules against bodies.
 
@@ -642,10 +630,12 @@ class Sight:
         return self._by_length[k]
 
 
-def rope_angle(poses: Poses, axis: Array) -> Array:
-    """(N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves."""
-    turned = poses.flange[:, :3, :3] @ (np.asarray(axis) / np.linalg.norm(axis))
-    return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
+def rope_angle(poses: Poses, load: HangingLoad) -> Array:
+    """(N,) between the vertical and the axis in which the rope leaves; 0 where nothing hangs."""
+    assert load.rope_axis is not None  # stated with the largest angle
+    turned = poses.flange[:, :3, :3] @ (load.rope_axis / np.linalg.norm(load.rope_axis))
+    angle = np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2])
+    return np.where(poses.loaded, angle, 0.0)
 
 
 class MotionBound:
@@ -744,8 +734,7 @@ class Paths:
         self._kinematics, self._load = kinematics, load
         self._collisions = Collisions(kinematics, pairs)
         self._bound = MotionBound(kinematics, pairs)
-        revolute = [joint.kind == "revolute" for joint in kinematics.chain.joints]
-        self._revolute = np.array(revolute, dtype=float)
+        self._turning = kinematics.chain.turning.astype(float)
 
     def free(self, q_from: Array, q_to: Array, loaded: BoolArray) -> BoolArray:
         free = np.ones(len(q_from), dtype=bool)
@@ -779,10 +768,8 @@ class Paths:
         doubtful = np.flatnonzero(~certain)
         refused = np.zeros(len(poses), dtype=bool)
         refused[doubtful] = self._collisions.hits(poses.take(doubtful)) | (octave[doubtful] == 0)
-        load = self._load
-        if load is not None and load.rope_axis is not None and load.max_angle is not None:
-            most = load.max_angle + ROPE_TOLERANCE
-            angle = np.where(poses.loaded, rope_angle(poses, load.rope_axis), 0.0)
-            certain &= angle + half @ self._revolute <= most
+        if (load := self._load) is not None and load.max_angle is not None:
+            most, angle = load.max_angle + ROPE_TOLERANCE, rope_angle(poses, load)
+            certain &= angle + half @ self._turning <= most
             refused |= angle > most
         return certain, refused

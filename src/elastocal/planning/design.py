@@ -7,6 +7,7 @@ from bisect import bisect_left
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import count
 from typing import Literal
 
@@ -44,10 +45,9 @@ from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import CRITERIA, criterion_named
-from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.feasibility import CandidateCounts, Feasibility
 from elastocal.planning.information import (
     IDENTIFIED,
-    Done,
     Known,
     lacks_noise,
     measured,
@@ -56,7 +56,6 @@ from elastocal.planning.information import (
     with_noise_of,
 )
 from elastocal.planning.plan import (
-    CandidateCounts,
     Chance,
     Gain,
     Plan,
@@ -166,19 +165,16 @@ def design(
             return whole.run()
         # An assembled model knows no markers but the cell's, nor the file's names of joints.
         cell = Model(cell, read).cell
-        choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
+        choice = Choice(whole.model, *whole.targets, whole.known, options.seed, progress)
         chosen = None if spec.choose is None else choice.best()
         placed = cell if chosen is None else applied(chosen, cell)
 
         def plan_of(cell: Cell) -> Plan:
-            own = checkpoint
-            if spec.minutes:  # poses come in several numbers
-                own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
+            # Within a time poses come in several numbers.
+            own = replace(checkpoint, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
             return replace(_Design(cell, options, own, progress, whole).run(), chosen=chosen)
 
-        if not spec.minutes:
-            return plan_of(placed)
-        return within(choice, placed, plan_of, spec.minutes)
+        return within(choice, placed, plan_of, spec.minutes) if spec.minutes else plan_of(placed)
 
 
 class _Design:
@@ -198,10 +194,8 @@ class _Design:
         self.model = Model(cell, options.done.marker_names if options.done else ())
         self._leave_out()
         # What the cell as it stands says of test poses and of measurements holds for others too.
-        self.work: Model = self.model if first is None else first.work
-        self.done: Done | None = None if first is None else first.done
-        self.cell = self.model.cell
-        self.chain = self.model.chain
+        self.first = first
+        self.cell, self.chain = self.model.cell, self.model.chain
         check_cell(self.cell, self.chain)
         _check_criterion(self.model)
         self.forces = plan_forces(self.cell)
@@ -270,8 +264,8 @@ class _Design:
         if self.conditions is None:
             return plan
         whole, fixed = self.conditions
-        known = replace(self.known(), fixed=fixed)
-        return promised(whole, self.model, plan, self.targets()[0], known)
+        known = replace(self.known, fixed=fixed)
+        return promised(whole, self.model, plan, self.targets[0], known)
 
     def _chosen(self) -> Plan:
         progress, options = self.progress, self.options
@@ -282,15 +276,15 @@ class _Design:
         shares = self._shares()
         planned = [self._shares(n) for n in options.curve]
         planned += [shares] if self.cell.design.target is None else []
-        targets, region = self.targets()
+        targets, region = self.targets
         q, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted, self.refused)
-        known = self.known()
+        known, stated = self.known, self.first or self
         progress("information of the candidates")
         setup = set_up(
             self.model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen, self.work, options.hold,
+            region, self.feasibility.seen, stated.model, options.hold,
         )  # fmt: skip
         self.warnings += setup.warnings
         if pins is not None and len(pins.q):
@@ -329,8 +323,8 @@ class _Design:
             self.progress("gain with the smooth functions")
             fixed = tuple(name for name in self.fixed if whole.meant_by(name))
             known = Known(fixed, options.prior, measured(whole, done, fixed))
-            targets, sight = self.targets()[0], self.feasibility.seen
-            setup = set_up(whole, q, len(q), targets, known, sight=sight, hold=True)
+            sight = self.feasibility.seen
+            setup = set_up(whole, q, len(q), self.targets[0], known, sight=sight, hold=True)
             M = setup.gathered(setup.information.blocks(q, readings))
         if done is None or setup.target_rows is None:
             return None
@@ -346,17 +340,21 @@ class _Design:
         )
         return shares
 
+    @cached_property
     def known(self) -> Known:
-        options = self.options
-        if options.done is not None and self.done is None:
+        options, done = self.options, None if self.first is None else self.first.known.done
+        if options.done is not None and done is None:
             self.progress("information of the measurements done")
-            self.done = measured(self.model, options.done, options.fixed)
-            if self.done.note != IDENTIFIED:
-                self.warnings.append(f"the plan is made for {self.done.note}")
-        return Known(options.fixed, options.prior, self.done)
+            done = measured(self.model, options.done, options.fixed)
+            if done.note != IDENTIFIED:
+                self.warnings.append(f"the plan is made for {done.note}")
+        return Known(options.fixed, options.prior, done)
 
+    @cached_property
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
-        cell, seed = self.work.cell, self.options.seed
+        if self.first is not None:
+            return self.first.targets
+        cell, seed = self.cell, self.options.seed
         # There the arm works, and the tracker need not see it.
         workspace = replace(cell.workspace, visibility=None, load=None)
         at_work = Feasibility(replace(cell, workspace=workspace), self.chain)
@@ -389,20 +387,18 @@ class _Design:
         return found | {"told": told, "counts": json.dumps(asdict(drawn.counts))}
 
     def _curve(self, setup: Setup, pool: FeasiblePool) -> tuple[PlanSize, ...]:
-        if not self.options.curve:
-            return ()
-
         def make() -> State:
             found = sized_plans(
                 lambda n: setup.problem(pool, self._shares(n)), self.options.curve,
                 self.options.seed, self.progress,
             )  # fmt: skip
-            return {"n": list(found), "value": list(found.values())}
+            return {str(n): size for n, size in found.items()}
 
-        state, figure = self.checkpoint.finished("sizes", make), setup.criterion.figure
+        sizes = self.checkpoint.finished("sizes", make) if self.options.curve else {}
+        figure = setup.criterion.figure
         return tuple(
             PlanSize(int(n), figure(value), None if np.isnan(bound) else figure(bound))
-            for n, (value, bound) in zip(state["n"], state["value"], strict=True)
+            for n, (value, bound) in sizes.items()
         )
 
     def _fewest(
@@ -471,7 +467,7 @@ class _Design:
         names = self._names(pool, chosen, len(found.pool))
         if few := ", ".join(names[k] for k in execution.one_sided):
             self.warnings.append(f"approached from one side only, as the other is blocked: {few}")
-        spec, model, done = self.cell.design, setup.information.model, self.done
+        spec, model, done = self.cell.design, setup.information.model, self.known.done
         M = setup.gathered(blocks)
         without = np.stack([setup.gathered(np.delete(blocks, k, axis=0)) for k in range(len(q))])
         noise, left = model.cell.noise, M

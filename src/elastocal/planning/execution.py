@@ -7,7 +7,6 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -145,59 +144,45 @@ PATIENT, ROUNDS = 4, 12
 HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
 
 
-@dataclass(frozen=True)
 class VisitTimes:
     """When each visit of an order is read, and what a drift then does: `change` (V + 1, V + 1) s of
     a change of load, `visit` s of reading at a node, `share` (V, m·3) of each visit, None where no
-    drift counts.  Of travel `longest` s are allowed and `usual` s usual; a bias of `enough` per m
-    of drift is as good as none."""
+    drift counts.  Of travel `longest` s are allowed, and `usual` s usual, as of the order `begun`;
+    a bias of `enough` per m of drift is as good as none."""
 
-    moves: Moves
-    travel: Array
-    change: Array
-    visit: float
-    share: Array | None
-    usual: float
-    longest: float = np.inf
-    enough: float = 1.0
+    share: Array | None = None
+    longest = np.inf
+    enough = 1.0
 
-    @classmethod
-    def of(cls, moves: Moves, motion: Motion, begun: list[int]) -> VisitTimes:
+    def __init__(self, moves: Moves, motion: Motion, begun: list[int]) -> None:
         carried = np.array([moves.carries(node) for node in range(len(moves.pose) + 1)])
-        change = np.where(carried[:, None] != carried[None], motion.load_change, 0.0)
-        visit = motion.dwell * (1 if moves.signs is None else 2)
-        made = cls(moves, moves.travel(), change, visit, None, 1.0)
-        return replace(made, usual=max(made.driving(begun), np.finfo(float).tiny))
+        self.moves = moves
+        self.change = np.where(carried[:, None] != carried[None], motion.load_change, 0.0)
+        self.visit = motion.dwell * (1 if moves.signs is None else 2)
+        self.know()
+        self.usual = max(self.driving(begun), np.finfo(float).tiny)
 
-    def drifting(self, alias: Alias | None, longest: float) -> VisitTimes:
-        """Where a drift does what `alias` says, and so much travel is allowed."""
-        made = replace(self, longest=longest)
-        if alias is None:
-            return made
-        pose, load = self.moves.pose, self.moves.load
-        times = np.zeros(alias.share.shape[:2])  # that each is read; each time with a part of it
-        np.add.at(times, (pose, load), 1.0)
-        share = alias.share[pose, load] / times[pose, load][:, None, None]
-        enough = HARMLESS * alias.noise / DRIFT
-        return replace(made, share=share.reshape(len(pose), -1), enough=enough)
+    def know(self) -> None:
+        """Take over what the moves have learnt of their ways."""
+        self.travel = self.moves.travel()
+        self._lists, self._step = self.travel.tolist(), self.travel + self.change + self.visit
 
-    def known(self) -> VisitTimes:
-        return replace(self, travel=self.moves.travel())
+    def judge(self, alias: Alias | None, longest: float) -> None:
+        """A drift does what `alias` says, and so much travel is allowed."""
+        self.longest = longest
+        if alias is not None:
+            pose, load = self.moves.pose, self.moves.load
+            times = np.zeros(alias.share.shape[:2])  # that each is read, with a part of it
+            np.add.at(times, (pose, load), 1.0)
+            share = alias.share[pose, load] / times[pose, load][:, None, None]
+            self.share, self.enough = share.reshape(len(pose), -1), HARMLESS * alias.noise / DRIFT
 
     def possible(self, tour: list[int]) -> bool:
         return self.driving(tour) <= self.longest
 
     def driving(self, tour: list[int]) -> float:
-        travel = self._travel
+        travel = self._lists
         return sum(travel[u][v] for u, v in pairwise([0, *tour, 0]))
-
-    @cached_property
-    def _travel(self) -> list[list[float]]:
-        return self.travel.tolist()
-
-    @cached_property
-    def _step(self) -> Array:
-        return self.travel + self.change + self.visit
 
     def time(self, tour: list[int]) -> float:
         ring = np.array([0, *tour, 0])
@@ -252,48 +237,44 @@ class VisitTimes:
                     best, least = here, price
         return best
 
-    def cleared(
-        self, tour: list[int], seed: int, progress: Progress
-    ) -> tuple[list[int], VisitTimes]:
-        clock, moves, rounds = self, self.moves, 0
+    def cleared(self, tour: list[int], seed: int, progress: Progress) -> list[int]:
+        moves, rounds = self.moves, 0
         while moves.check(tour):  # blocked moves are gone round
             progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
             rounds += 1
             if rounds == PATIENT:
                 moves.settle()
-            clock = clock.known()
+            self.know()
             if rounds <= ROUNDS:
-                tour = clock.annealed(tour, seed + rounds, MENDING, WARM)
-        return tour, clock
+                tour = self.annealed(tour, seed + rounds, MENDING, WARM)
+        return tour
 
     def searched(
-        self, near: list[int], seed: int, progress: Progress,
-        hot: Sequence[float], steps: int,
-    ) -> tuple[list[int], VisitTimes]:  # fmt: skip
-        best, clock = self.cleared(near, seed, progress)
+        self, near: list[int], seed: int, progress: Progress, hot: Sequence[float], steps: int
+    ) -> list[int]:
+        best = self.cleared(near, seed, progress)
         for k, temperature in enumerate(hot, start=1):
             # Enough where a drift does no harm any more; without one the way alone counts.
-            drifts = clock.share is not None
-            if drifts and clock.possible(best) and clock.bias(best) <= clock.enough:
+            drifts = self.share is not None
+            if drifts and self.possible(best) and self.bias(best) <= self.enough:
                 break
-            new = clock.annealed(best, seed + k, steps, temperature)
-            new, clock = clock.cleared(new, seed, progress)
-            best = min(best, new, key=clock.price)
-        return best, clock
+            new = self.annealed(best, seed + k, steps, temperature)
+            best = min(best, self.cleared(new, seed, progress), key=self.price)
+        return best
 
 
 def against_drift(
-    plain: VisitTimes, motion: Motion, tour: list[int], alias: Alias | None, seed: int,
+    clock: VisitTimes, motion: Motion, tour: list[int], alias: Alias | None, seed: int,
     progress: Progress,
 ) -> tuple[list[int], VisitTimes, Drifting | None]:  # fmt: skip
     """The visits of the shortest `tour` in the order that a drift harms least, the clock that they
     are nodes of, and what the drift does.  Where there is time for it, all poses are read twice
     without load; where no extra time is stated, if (ρ² + b²) t falls, of the error at the test
     poses ρ, the drift's part of it b and the time t: if more readings would give less."""
-    moves = plain.moves
+    moves = clock.moves
     used = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
-    clock = plain.drifting(alias, plain.driving(tour) + motion.longer * plain.time(tour))
+    clock.judge(alias, clock.driving(tour) + motion.longer * clock.time(tour))
     before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
     as_pays = motion.extra_time is None
 
@@ -310,20 +291,22 @@ def against_drift(
     # Can it pay, if no drift is left at all?
     pays = harm(0.0, clock.time(tour) + longer) < harm(once_bias, once_time)
     if alias is not None and len(again) and pays and left >= clock.driving(tour):
-        own = VisitTimes.of(spread, motion, tour).drifting(alias, left)
+        own = VisitTimes(spread, motion, tour)
+        own.judge(alias, left)
         begun = own.annealed(in_turns([*tour, *again], spread.load, sequence), seed, FEW, WARM)
-        found, own = own.searched(begun, seed, progress, HOT, STEPS)
+        found = own.searched(begun, seed, progress, HOT, STEPS)
         if own.possible(found):
             twice, twice_harms = (found, own), harm(own.bias(found), own.time(found))
     if harm(HOPED * once_bias, once_time) <= twice_harms:
-        once, clock = clock.known().searched(once, seed, progress, HOT, STEPS)
+        clock.know()
+        once = clock.searched(once, seed, progress, HOT, STEPS)
         more = bool(motion.load_changes) and alias is None
         if not clock.possible(once) or not (more or clock.bias(once) < before):
             once = tour
     if twice is not None and twice_harms < harm(clock.bias(once), clock.time(once)):
         once, clock = twice
     while clock.moves.check(once):
-        clock = clock.known()
+        clock.know()
     drift = None
     if alias is not None:
         drift = Drifting(DRIFT * clock.bias(once), DRIFT * before, noise, alias.at_test_poses)
@@ -491,7 +474,7 @@ def _stops(moves: Moves, u: int, v: int) -> list[Stop]:
 
 
 def _time(moves: Moves, way: list[int]) -> float:
-    return float(sum(moves.times[i, j] for i, j in pairwise(way)))
+    return float(sum(moves.maps[0].times[i, j] for i, j in pairwise(way)))
 
 
 def nearest_first(cost: Array) -> list[int]:
@@ -525,8 +508,8 @@ def schedule(
     # Load states one after the other, without load first.
     used = sorted(set(moves.load.tolist()), key=lambda state: (moves.loaded[state], state))
     begun = in_turns(nearest_first(moves.travel()), moves.load, used)
-    clock, drift = VisitTimes.of(moves, motion, begun), None
-    tour, clock = clock.searched(begun, seed, progress, (SHORT,), PER_VISIT * len(begun))
+    clock, drift = VisitTimes(moves, motion, begun), None
+    tour = clock.searched(begun, seed, progress, (SHORT,), PER_VISIT * len(begun))
     if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, clock, drift = against_drift(clock, motion, tour, alias, seed, progress)
     moves, order = clock.moves, [(node, 0) for node in tour]

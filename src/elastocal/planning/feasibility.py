@@ -16,7 +16,7 @@ from scipy.sparse import csgraph
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import Motion
-from elastocal.messages import InputError, InsufficientDataError, rounded, some
+from elastocal.messages import InputError, InsufficientDataError, require, rounded, some
 from elastocal.model.chain import Chain, finite_ranges, joint_limits, told
 from elastocal.model.effects.catalogue import SymbolicArm
 from elastocal.model.effects.statics import GravityCompensator
@@ -33,7 +33,6 @@ from elastocal.planning.collision import (
     Sight,
     cell_bodies,
     cell_pairs,
-    incidence,
     marker_positions,
     rope_angle,
 )
@@ -231,6 +230,13 @@ class StaticTorque:
 
 
 @dataclass(frozen=True)
+class CandidateCounts:
+    tried: int
+    feasible: int
+    removed_by: dict[str, int]
+
+
+@dataclass(frozen=True)
 class PoseFeasibility:
     """What the `rules` (R) say of candidates `q` (N, n) under `force` (N, 3): `broken` (N, R)."""
 
@@ -244,10 +250,11 @@ class PoseFeasibility:
         return np.asarray(~self.broken.any(axis=1))
 
     @property
-    def removed_by(self) -> dict[str, int]:
-        """Candidates by the first rule they break: tried = feasible + Σ removed_by."""
+    def counts(self) -> CandidateCounts:
+        """Each by the first rule that it breaks: tried = feasible + Σ removed_by."""
         first = (self.broken & (self.broken.cumsum(axis=1) == 1)).sum(axis=0)
-        return dict(zip(self.rules, first.tolist(), strict=True))
+        removed_by = dict(zip(self.rules, first.tolist(), strict=True))
+        return CandidateCounts(len(self.q), int(self.ok.sum()), removed_by)
 
 
 # The rules that a cell states, in the order of checking: cheap ones first.
@@ -283,48 +290,49 @@ def _visibility(cell: Cell) -> Iterator[Rule]:
     sight, eye = cell.workspace.visibility, cell.tracker.position
     if sight is None:
         return
-    if not cell.tool.markers:
-        raise InputError(
-            f"{cell.source}: [workspace.visibility] needs the markers; give [tool.markers_m]"
-        )
-    names, markers = tuple(cell.tool.markers), list(cell.tool.markers.values())
+    markers = cell.tool.markers
+    require(
+        bool(markers),
+        f"{cell.source}: [workspace.visibility] needs the markers; give [tool.markers_m]",
+    )
     near, far = sight.range
 
+    def to_eye(poses: Poses, names: Sequence[str]) -> Array:
+        return eye - marker_positions(poses, [markers[name] for name in names])
+
     def distance(poses: Poses) -> Array:
-        return np.asarray(np.linalg.norm(marker_positions(poses, markers) - eye, axis=2))
+        return np.asarray(np.linalg.norm(to_eye(poses, tuple(markers)), axis=2))
 
     if near > 0 or np.isfinite(far):
-        yield Bound("range", distance, near, far, names, "a range_m", ("m",))
-    observed = tuple(name for name in names if name in sight.normals)
-    if sight.max_incidence is not None and observed:
-        at = [cell.tool.markers[name] for name in observed]
-        axes = [sight.normals[name] for name in observed]
-        yield Bound(
-            "incidence", lambda p: incidence(p, at, axes, eye), 0.0, sight.max_incidence, observed,
-            "a max_incidence_deg", ("°",),
-        )  # fmt: skip
+        yield Bound("range", distance, near, far, tuple(markers), "a range_m", ("m",))
+    observed = tuple(name for name in markers if name in sight.normals)
+
+    def incidence(poses: Poses) -> Array:
+        line, normals = to_eye(poses, observed), np.array([sight.normals[n] for n in observed])
+        axes = np.einsum("nij,mj->nmi", poses.flange[:, :3, :3], normals)
+        across = np.linalg.norm(np.cross(axes, line), axis=2)
+        return np.asarray(np.arctan2(across, np.einsum("nmi,nmi->nm", axes, line)))
+
+    if (most := sight.max_incidence) is not None and observed:
+        yield Bound("incidence", incidence, 0.0, most, observed, "a max_incidence_deg", ("°",))
 
 
 def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
     load = cell.workspace.load
-    if load is not None and load.max_angle is not None and load.rope_axis is not None:
-        axis = load.rope_axis
-
-        def angle(poses: Poses) -> Array:
-            return np.where(poses.loaded, rope_angle(poses, axis), 0.0)[:, None]
-
-        label, key = ("the rope",), "a max_angle_deg"
-        yield Bound("rope_angle", angle, 0.0, load.max_angle, label, key, ("°",))
-    if cell.workspace.torque_limits:
-        bound = np.array(cell.workspace.torque_limits)
-        if len(bound) != chain.n_joints:
-            raise InputError(
-                f"{cell.source}: [workspace] torque_limits_Nm has {len(bound)} values, "
-                f"but robot '{chain.name}' has {chain.n_joints} joints"
-            )
+    if load is not None and load.max_angle is not None:
+        yield Bound(
+            "rope_angle", lambda p: rope_angle(p, load)[:, None], 0.0, load.max_angle,
+            ("the rope",), "a max_angle_deg", ("°",),
+        )  # fmt: skip
+    if bound := cell.workspace.torque_limits:
+        require(
+            len(bound) == chain.n_joints,
+            f"{cell.source}: [workspace] torque_limits_Nm has {len(bound)} values, "
+            f"but robot '{chain.name}' has {chain.n_joints} joints",
+        )
         torque = StaticTorque(cell, chain)
         yield Bound(
-            "torque", lambda p: np.abs(torque(p)), 0.0, bound, joints,
+            "torque", lambda p: np.abs(torque(p)), 0.0, np.array(bound), joints,
             "a torque_limits_Nm", ("N m",),
         )  # fmt: skip
 
@@ -459,13 +467,16 @@ class Roadmap:
     move counts as free until it is checked; a blocked one is replaced by the fastest way through
     other points.  So costs never exceed the true ones (Bohlin and Kavraki 2000)."""
 
-    def __init__(self, points: Array, times: Array, loaded: bool, checker: Feasibility) -> None:
+    def __init__(
+        self, points: Array, speed: Array | None, loaded: bool, checker: Feasibility
+    ) -> None:
         self.points, self.loaded, self.checker = points, loaded, checker
         self.carrying = " with the load" if loaded else ""
-        self.direct = times.copy()  # inf where blocked
-        self.checked = np.eye(len(times), dtype=bool)
+        self.times = travel_times(points, speed)
+        self.direct = self.times.copy()  # inf where blocked
+        self.checked = np.eye(len(points), dtype=bool)
 
-    def check(self, moves: Iterable[tuple[int, int]]) -> bool:
+    def check(self, moves: Iterable[Sequence[int]]) -> bool:
         """All free?  Each move is checked once, those not checked before together."""
         pairs = sorted({(min(move), max(move)) for move in moves})
         new = [pair for pair in pairs if not self.checked[pair]]
@@ -502,36 +513,39 @@ class Roadmap:
             self.check(move for way in ways for move in pairwise(way))
             left = [(w[0], w[-1]) for w in ways if np.isinf(self.direct[w[:-1], w[1:]]).any()]
 
+    @property
+    def _graph(self) -> Array:
+        finite = self.direct[np.isfinite(self.direct)]
+        return self.direct + max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
+
     @cached_property
     def _shortest(self) -> tuple[Array, NDArray[np.integer]]:
-        finite = self.direct[np.isfinite(self.direct)]
-        extra = max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
-        return csgraph.shortest_path(self.direct + extra, method="FW", return_predecessors=True)
+        return csgraph.shortest_path(self._graph, method="FW", return_predecessors=True)
 
     def parts(self, needed: list[int]) -> list[list[int]]:
         """`needed` points by what free moves connect, the largest part first.  Only as many moves
-        are checked as it takes, first among `needed`, then through all points: every part tries its
-        shortest ways out, twice as many each time (Borůvka)."""
-        for among, tries in ((np.array(needed), 1), (np.arange(len(self.points)), 1)):
-            while len(set((label := self._joined())[needed])) > 1:
-                new: list[tuple[int, int]] = []
-                for part in set(label[among]):
-                    own, others = among[label[among] == part], among[label[among] != part]
-                    out = self.direct[np.ix_(own, others)]
-                    first = np.argsort(out, axis=None, kind="stable")[:tries]
-                    i, j = np.unravel_index(first[np.isfinite(out.ravel()[first])], out.shape)
-                    new += zip(own[i].tolist(), others[j].tolist(), strict=True)
-                if not new:
-                    break
-                self.check(new)
-                tries *= 2
-        found = [[p for p in needed if label[p] == part] for part in dict.fromkeys(label[needed])]
+        are checked as it takes: those of the shortest trees among `needed`, then through all
+        points, until all of one are free."""
+        for among in (np.array(needed), np.arange(len(self.points))):
+            free = False
+            while not free:
+                tree = csgraph.minimum_spanning_tree(self._graph[np.ix_(among, among)])
+                free = self.check(among[np.transpose(tree.nonzero())].tolist())
+            label = dict(zip(among, csgraph.connected_components(tree, False)[1], strict=True))
+            names = dict.fromkeys(label[point] for point in needed)
+            found = [[point for point in needed if label[point] == name] for name in names]
+            if len(found) == 1:
+                break
         return sorted(found, key=len, reverse=True)
 
-    def _joined(self) -> IntArray:
-        """A label (m,) for each part that is known to hang together."""
-        free = self.checked & np.isfinite(self.direct)
-        return np.asarray(csgraph.connected_components(free, directed=False)[1])
+    def name(self, point: int, home: int | None) -> str:
+        chain = self.checker.chain
+        joints = ", ".join(told(chain, j, value) for j, value in enumerate(self.points[point]))
+        return f"{'home' if point == home else f'pose {point + (home is None)}'} (joints {joints})"
+
+    def in_the_way(self, i: int, j: int) -> str:
+        names = self.checker.blockers(self.points[i], self.points[j], self.loaded)
+        return f" (in the way: {', '.join(names)})" if names else ""
 
 
 MOST_NAMED = 3
@@ -547,15 +561,14 @@ class Unreachable(InsufficientDataError):
 
 @dataclass(frozen=True)
 class Moves:
-    """Home, poses, points of approach and via points in one list, `points` (m, n), with `times` (m,
-    m) between them, the roadmaps `maps` without and with load, and V visits among them: of `pose`
-    (V,) in the load state `load` (V,), left from `leave` (V,), where the pose is.  `sides` (V, 2)
-    are the points from which it is approached, with `signs` (N, 2, n), and which of them are `free`
-    (V, 2); without approaches the pose itself."""
+    """Home, poses, points of approach and via points in one list, `points` (m, n), the roadmaps
+    `maps` between them without and with load, and V visits among them: of `pose` (V,) in the load
+    state `load` (V,), left from `leave` (V,), where the pose is.  `sides` (V, 2) are the points
+    from which it is approached, with `signs` (N, 2, n), and which of them are `free` (V, 2);
+    without approaches the pose itself."""
 
     points: Array
-    times: Array
-    maps: tuple[Roadmap, Roadmap]
+    maps: tuple[Roadmap, ...]
     loaded: BoolArray
     home: int | None
     signs: IntArray | None
@@ -583,15 +596,14 @@ class Moves:
             between = (q[:, None] - signs * motion.overshoot).reshape(-1, n)
             sides = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
         points = np.vstack([start, q, between, np.zeros((0, n)) if via is None else via])
-        times = travel_times(points, motion.speed)
-        maps = (Roadmap(points, times, False, checker), Roadmap(points, times, True, checker))
+        maps = tuple(Roadmap(points, motion.speed, loaded, checker) for loaded in (False, True))
         loaded, free = (forces != 0).any(axis=1), np.ones(sides.shape, dtype=bool)
         for roadmap in maps if signs is not None else ():
             own = loaded[load] == roadmap.loaded
             ends = np.broadcast_to(leave[own, None], sides[own].shape)
             roadmap.check(zip(sides[own].ravel().tolist(), ends.ravel().tolist(), strict=True))
             free[own] = np.isfinite(roadmap.direct[sides[own], ends])
-        return cls(points, times, maps, loaded, home, signs, pose, load, leave, sides, free)
+        return cls(points, maps, loaded, home, signs, pose, load, leave, sides, free)
 
     @cached_property
     def side(self) -> IntArray:
@@ -605,7 +617,7 @@ class Moves:
     @cached_property
     def inside(self) -> Array:
         """(V,) s from there on: the approach, and to the other side and back; inf where blocked."""
-        to = self.times[self.leave[:, None], self.sides]
+        to = self.maps[0].times[self.leave[:, None], self.sides]
         first = to[np.arange(len(to)), self.side]
         both = np.where(self.free.all(axis=1), 2 * to[:, -1], 0.0) if self.signs is not None else 0
         return np.where(self.free.any(axis=1), first + both, np.inf)
@@ -672,7 +684,7 @@ class Moves:
             roadmap, way = self.way(u, v)
             # Where no way is left, every move has been checked: nothing to be learnt.
             wanted[roadmap.loaded] += [m for m in pairwise(way) if np.isfinite(roadmap.direct[m])]
-        return not all([self.maps[k].check(wanted[k]) for k in (0, 1)])
+        return not all([roadmap.check(wanted[roadmap.loaded]) for roadmap in self.maps])
 
     def settle(self) -> None:
         """Check the ways between all visits: many at once take less time than a few again and
@@ -697,9 +709,9 @@ class Moves:
             for v in np.flatnonzero(here & ~self.free.any(axis=1)):
                 pose, (below, above) = int(self.leave[v]), self.sides[v].tolist()
                 raise Unreachable(
-                    f"{self._name(pose)} cannot be approached{roadmap.carrying}, neither from below"
-                    f"{self._in_the_way(roadmap, below, pose)} nor from above"
-                    f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
+                    f"{roadmap.name(pose, self.home)} cannot be approached{roadmap.carrying}, "
+                    f"neither from below{roadmap.in_the_way(below, pose)} nor from above"
+                    f"{roadmap.in_the_way(above, pose)}; lower overshoot_deg in "
                     "[design.motion], or raise clearance_mm in [workspace]",
                     self.pose[v],
                 )
@@ -717,11 +729,11 @@ class Moves:
                 raise self._unreachable(roadmap, every if clear else lost[0])
 
     def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
-        named = some(map(self._name, lost), MOST_NAMED)
+        named = some((roadmap.name(point, self.home) for point in lost), MOST_NAMED)
         others = np.setdiff1d(np.arange(len(self.points)), lost)
-        between = self.times[lost][:, others]
+        between = roadmap.times[lost][:, others]
         i, j = np.unravel_index(int(np.argmin(between)), between.shape)
-        by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
+        by = roadmap.in_the_way(int(others[j]), lost[int(i)])
         return Unreachable(
             f"{named} cannot be reached{roadmap.carrying} by collision-free joint moves, "
             f"neither directly nor through home and other poses{by}; give another home in "
@@ -729,25 +741,13 @@ class Moves:
             *np.unique(self.pose[np.isin(self.leave, lost)]),
         )
 
-    def _name(self, point: int) -> str:
-        chain = self.maps[0].checker.chain
-        joints = ", ".join(told(chain, j, value) for j, value in enumerate(self.points[point]))
-        if point == self.home:
-            return f"home (joints {joints})"
-        return f"pose {point + (self.home is None)} (joints {joints})"
-
-    def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
-        names = roadmap.checker.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
-        return f" (in the way: {', '.join(names)})" if names else ""
-
 
 def approach_signs(chain: Chain, q: Array, lower: Array, upper: Array, by: float) -> IntArray:
     """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first upwards
     (+1), then down (−1), so that backlash and hysteresis show; both from the same side where the
     other is beyond the limits."""
     below, above = q - by >= lower, q + by <= upper
-    if not (below | above).all():
-        i, j = (int(v) for v in np.argwhere(~(below | above))[0])
+    for i, j in np.argwhere(~(below | above)).tolist():
         raise InputError(
             f"pose {i + 1}: joint {j + 1} has no room on either side of {told(chain, j, q[i, j])} "
             f"for an overshoot of {told(chain, j, by)}; lower overshoot_deg in "

@@ -25,6 +25,7 @@ from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
+from elastocal.planning.feasibility import CandidateCounts
 from elastocal.planning.information import Estimable
 from elastocal.tables import csv_text
 from elastocal.units import Array, BoolArray, IntArray, to_si
@@ -127,33 +128,23 @@ def write_plan(
 ) -> None:
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm; with the forces of the
     rows or not, and `more` columns."""
-    names = [table.configuration_labels[k] for k in table.configuration]
-    columns: dict[str, Sequence[str]] = {"configuration": names}
+    found, kinds = table.columns(), table.joint_kinds
+    columns: dict[str, Any] = {"configuration": found["configuration"]}
     if table.marker_names != (DEFAULT_MARKER,):
-        columns["marker"] = [table.marker_names[k] for k in table.marker]
+        columns["marker"] = found["marker"]
     if table.repeat.any():
-        columns["repeat"] = [str(k) for k in table.repeat]
-    kinds = table.joint_kinds
-    blocks = [(joint_columns(kinds), np.round(in_file_units(table.q, kinds), DIGITS) + 0.0)]
+        columns["repeat"] = table.repeat
+    joints = np.round(in_file_units(table.q, kinds), DIGITS) + 0.0
+    columns |= zip(joint_columns(kinds), joints.T, strict=True)
     if forces:
-        blocks.append((["force_x_N", "force_y_N", "force_z_N"], table.force + 0.0))
+        columns |= {h: found[h] + 0.0 for h in ("force_x_N", "force_y_N", "force_z_N")}
     if table.approach is not None:
-        blocks.append((list(families(kinds)["approach"].units), table.approach.astype(int)))
+        columns |= {h: found[h] for h in families(kinds)["approach"].units}
     if table.time is not None:
-        blocks.append((["time_s"], np.round(table.time[:, None], 3)))
-    for heads, values in blocks:
-        columns |= {
-            h: [repr(v) for v in own] for h, own in zip(heads, values.T.tolist(), strict=True)
-        }
+        columns["time_s"] = np.round(table.time, 3)
     columns |= more
-    atomic_write(path, csv_text(columns, zip(*columns.values(), strict=True)))
-
-
-@dataclass(frozen=True)
-class CandidateCounts:
-    tried: int
-    feasible: int
-    removed_by: dict[str, int]
+    rows = zip(*(np.asarray(values).tolist() for values in columns.values()), strict=True)
+    atomic_write(path, csv_text(columns, rows))
 
 
 @dataclass(frozen=True)
@@ -472,7 +463,7 @@ class Plan(Result):
         own = tuple(self.model.cell.tool.markers)
         first, n = [row[0][1] for row in rows], len(rows)
         two = self.execution.motion.both_directions or any(stop.side for stop in first)
-        names = [stop.name(self.configurations) + ("+", "-")[stop.side] * two for stop in first]
+        names = [stop.name(self.names) + ("+", "-")[stop.side] * two for stop in first]
         labels = tuple(dict.fromkeys(names))
         approach = [stop.approach for stop in first if stop.approach is not None]
         times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
@@ -530,10 +521,6 @@ class Plan(Result):
         every, some = self.seen[k].all(axis=0), self.seen[k].any(axis=0)
         told = zip(names, every, some, strict=True)
         return " ".join(name if all_ else f"({name})" for name, all_, any_ in told if any_)
-
-    @property
-    def configurations(self) -> tuple[str, ...]:
-        return self.names
 
     @property
     def group_names(self) -> tuple[str, ...]:
@@ -598,7 +585,7 @@ class Plan(Result):
                 {
                     "configuration": k + 1,
                     "markers": self.markers(k),
-                    "name": self.configurations[k],
+                    "name": self.names[k],
                     "loads_N": self.forces[self.readings[k] > 0].tolist(),
                     "readings": int(self.readings[k].max()),
                     "value_without": None if not np.isfinite(r.loss) else r.loss,

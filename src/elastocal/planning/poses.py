@@ -53,9 +53,8 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.planning.collision import data_base
-from elastocal.planning.feasibility import Feasibility, Struck
+from elastocal.planning.feasibility import CandidateCounts, Feasibility, Struck
 from elastocal.planning.information import Estimable, plan_forces
-from elastocal.planning.plan import CandidateCounts
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -200,7 +199,7 @@ def brought(
         rule = verdict.rules[int(broken.argmax())].replace("_", " ")
         refused.setdefault(rule, []).append(names[k])
     named = "; ".join(f"{rule} ({listed(by)})" for rule, by in refused.items() if by)
-    ok, removed = own[verdict.ok], verdict.removed_by | {NO_LEVEL: len(q) - len(own)}
+    ok, removed = own[verdict.ok], verdict.counts.removed_by | {NO_LEVEL: len(q) - len(own)}
     told = f"{table.source}: {len(q) - len(ok)} of {len(q)} poses are refused, by the rule that "
     told = f"{told}each breaks first: {named}" if named else ""
     if not len(ok):
@@ -229,9 +228,8 @@ def points(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Ite
 
 def _check(rules: Feasibility, forces: Array, group: int, q: Array) -> Candidates:
     verdict = rules.under(q, forces)
-    n = int(verdict.ok.sum())
-    counts = CandidateCounts(len(q), n, verdict.removed_by)
-    return Candidates(q[verdict.ok], np.full(n, group), counts)
+    kept = q[verdict.ok]
+    return Candidates(kept, np.full(len(kept), group), verdict.counts)
 
 
 def _checked(
@@ -515,6 +513,12 @@ class _Sources:
         loaded = np.zeros((0, 3)) if loads is None else loads[(loads != 0).any(axis=1)]
         return loaded if len(loaded) else np.zeros((1, 3))
 
+    def under(self, n: int, spec: Spec, own: Array | None) -> Array:
+        """Forces (L, n, 3) of n poses: their own (n, 3), else that of the spec, else each load."""
+        stated = None if spec is None else spec.force
+        loads = self.loads[:, None] if stated is None else stated[None, None]
+        return np.broadcast_to(loads, (len(loads), n, 3)) if own is None else own[None]
+
     def point(self, spec: Spec = None) -> Array:
         tool = self.cell.tool
         if spec is not None and spec.point is not None:
@@ -527,15 +531,12 @@ class _Sources:
         self, q: Array, source: str, spec: Spec = None, force: Array | None = None,
         weight: Array | None = None,
     ) -> TargetPoses:  # fmt: skip
-        """With their own `force` (n, 3), else that of the `spec`, else under each of the loads,
-        which share the `weight` (n,)."""
-        if force is None and spec is not None and spec.force is not None:
-            force = np.broadcast_to(spec.force, (len(q), 3))
-        each = len(self.loads) if force is None else 1
-        n = each * len(q)
+        """Each `under` its forces, which share its `weight` (n,)."""
+        under = self.under(len(q), spec, force)
+        each, n = len(under), len(under) * len(q)
         return TargetPoses(
             np.repeat(q, each, axis=0),
-            np.tile(self.loads, (len(q), 1)) if force is None else force,
+            under.swapaxes(0, 1).reshape(n, 3),
             np.repeat((np.ones(len(q)) if weight is None else weight) / each, each),
             source,
             np.broadcast_to(self.point(spec), (n, 3)),
@@ -593,15 +594,10 @@ class _Sources:
         lines: Sequence[str] = (), remedy: str = "",
     ) -> tuple[Array, str]:  # fmt: skip
         """Postures (T, n) with the point at places (T, 3) m of the data's frame, the flange at
-        `rotation` (T, 3, 3), None for any, each the first one found that the rules allow under
-        `force` (T, 3) N, else that of the spec, else all loads; where they allow none of many, the
-        first, and what to say of it."""
+        `rotation` (T, 3, 3), None for any, each the first one found that the rules allow `under`
+        all its forces; where they allow none of many, the first, and what to say of it."""
         cell, stuck = self.cell, np.arange(len(position))
         q = np.zeros((len(position), self.chain.n_joints))
-        under = [force] if force is not None else [
-            np.broadcast_to(load, position.shape)
-            for load in (self.loads if spec.force is None else [spec.force])
-        ]  # fmt: skip
         for count in (FEW, MANY):
             found = inverse_kinematics(
                 self.chain, position[stuck], joint_limits(cell, self.chain),
@@ -617,7 +613,7 @@ class _Sources:
                 return q, ""
             T, K, n = found.q.shape
             allowed = found.reached.copy()
-            for load in under:
+            for load in self.under(len(position), spec, force):
                 each = np.repeat(load[stuck], K, axis=0)
                 allowed &= self.rules.check(found.q.reshape(T * K, n), each, False).ok.reshape(T, K)
             some = allowed.any(axis=1)

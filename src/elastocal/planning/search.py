@@ -30,7 +30,7 @@ from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import configuration_rows
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
-from elastocal.planning.feasibility import Feasibility, Roadmap, Unreachable, travel_times
+from elastocal.planning.feasibility import Feasibility, Roadmap, Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.poses import CHUNK, JointSpace, draw, points
 from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, prospects
@@ -634,7 +634,7 @@ class _Ordering:
     def _joined(self, q: Array) -> Array:
         motion = self.rules.cell.design.motion
         points = q if motion.home is None else np.vstack([motion.home, q])
-        roadmap = Roadmap(points, travel_times(points, motion.speed), self.loaded, self.rules)
+        roadmap = Roadmap(points, motion.speed, self.loaded, self.rules)
         parts = roadmap.parts(list(range(len(points))))
         return points[parts[0] if motion.home is None else next(p for p in parts if 0 in p)]
 

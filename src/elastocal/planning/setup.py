@@ -364,21 +364,13 @@ class Boxes:
         return cls(tuple(boxes), corners[:, 0], corners[:, 1])
 
     def places(self, cell: Cell) -> Array:
-        known = cell.tool.markers | {
-            LOAD_POINT: cell.tool.load_point,
-            TRACKER: cell.tracker.position,
-        }
+        tool = cell.tool
+        known = tool.markers | {LOAD_POINT: tool.load_point, TRACKER: cell.tracker.position}
         return np.array([known[name] for name in self.names]).reshape(-1, 3)
 
     def at(self, unit: Array) -> Array:
         """Places (k, 3) of a point (3 k,) of the unit cube."""
         return self.lower + unit.reshape(-1, 3) * (self.upper - self.lower)
-
-    def unit(self, places: Array) -> Array:
-        """The point of the unit cube whose places are nearest; 0.5 where a box has no width."""
-        width = self.upper - self.lower
-        part = (places - self.lower) / np.where(width > 0, width, 1.0)
-        return np.clip(np.where(width > 0, part, 0.5), 0.0, 1.0).ravel()
 
     def placed(self, cell: Cell, places: Array) -> Cell:
         at = dict(zip(self.names, np.round(places, DIGITS), strict=True))
@@ -466,20 +458,18 @@ class Choice:
     def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
         cell = self.work.cell if begun is None else begun.cell
         draws = sobol(3 * len(boxes.names), np.random.default_rng(self.seed)).random(STARTS)
-        starts = [boxes.unit(boxes.places(cell)), *draws]
-        best = self._least("places, start", [boxes.placed(cell, boxes.at(s)) for s in starts])
+        starts = [boxes.places(cell).clip(boxes.lower, boxes.upper), *map(boxes.at, draws)]
+        best = self._least("places, start", [boxes.placed(cell, at) for at in starts])
+        if best is None:
+            return None
         for k in range(ROUNDS):
-            if best is None:
-                break
-            unit, there = boxes.unit(boxes.places(best.cell)), self._moved(boxes, best)
+            here, there = boxes.places(best.cell), self._moved(boxes, best)
             self.progress(f"choosing places, round {k + 1}")
             # All the way, or a part of it where the rules leave too little there.
-            way = (self.relaxed(boxes.placed(cell, boxes.at(unit + part * (there - unit))))
+            way = (self.relaxed(boxes.placed(cell, here + part * (there - here)))
                    for part in (1.0, 0.5, 0.25))  # fmt: skip
-            better = next(
-                (p for p in way if p is not None and p.relaxed.value < best.relaxed.value), None
-            )
-            if better is None:
+            found = (p for p in way if p is not None and p.relaxed.value < best.relaxed.value)
+            if (better := next(found, None)) is None:
                 break
             gain, best = 1 - better.relaxed.value / best.relaxed.value, better
             if gain < GAIN:
@@ -495,7 +485,8 @@ class Choice:
         return min(found, key=lambda point: point.relaxed.value, default=None)
 
     def _moved(self, boxes: Boxes, point: RelaxedPoint) -> Array:
-        """The point (3 k,) of the unit cube that lowers Φ most at the weights of `point`."""
+        """The places (k, 3) that lower Φ most at the weights of `point`, sought in units of the
+        boxes."""
         setup, pool, w = point.setup, point.pool, point.relaxed.weights
         used = np.flatnonzero(w > USED * w.max())
         there = _mobile(boxes, point.cell, setup.information)
@@ -505,10 +496,11 @@ class Choice:
             M = setup.gathered(B * np.sqrt(w[used])[:, None, None])
             return float(np.log(setup.criterion.of_information(M)))
 
-        unit = boxes.unit(boxes.places(point.cell))
-        limits = [(0.0, 1.0)] * len(unit)
+        width = np.maximum(boxes.upper - boxes.lower, np.finfo(float).tiny)
+        unit = ((boxes.places(point.cell) - boxes.lower) / width).clip(0.0, 1.0).ravel()
         how = {"maxiter": 20, "eps": STEP, "ftol": 1e-4}
-        return np.asarray(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
+        limits = [(0.0, 1.0)] * len(unit)
+        return boxes.at(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
 
     def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
         return draw(Feasibility(cell, self.work.chain), plan_forces(cell), candidates, self.seed)
@@ -611,7 +603,7 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
         choice.progress(f"within {rounded(minutes, 4)} minutes: {repeats} readings each")
         read = found[-1].read if found else None
         with suppress(InsufficientDataError):
-            found += _fitting(choice, cell, minutes, drawn, repeats, read)
+            found.append(_fitting(choice, cell, minutes, drawn, repeats, read))
         values = [fit.value for fit in found]
         if len(found) > WORSE and min(values[-WORSE:]) > min(values):
             break
@@ -629,9 +621,9 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
 def _fitting(
     choice: Choice, cell: Cell, minutes: float, drawn: Candidates, repeats: int,
     read: BoolArray | None,
-) -> list[_Fit]:  # fmt: skip
-    """As many poses as fit, candidates being `read` in load states that were chosen before; empty
-    or an error where there is none."""
+) -> _Fit:  # fmt: skip
+    """As many poses as fit, candidates being `read` in load states that were chosen before; an
+    error where there is none."""
     # What poses read twice would take, more poses may have.
     motion = replace(cell.design.motion, extra_time=cell.design.motion.longer)
     spec = replace(cell.design, per_level=(), repeats=repeats, minutes=None, motion=motion)
@@ -646,7 +638,7 @@ def _fitting(
     )  # fmt: skip
     point = choice.relaxed(sized(poses), drawn, read) if poses else None
     if point is None:
-        return []
+        raise InsufficientDataError("too little time, or something stays open")
     problem = point.setup.problem(point.pool, shares_of(point.cell))
     problem.check_enough()
     chosen, phi = exact_plan(problem.balanced(), point.relaxed)
@@ -656,7 +648,7 @@ def _fitting(
     value = point.setup.criterion.figure(phi / more)
     size = TimedSize(round(len(chosen) * more), repeats, took * more, value)
     whole, read = sized(round(poses * more)), point.setup.ways > 0
-    return [_Fit(len(problem.prior), phi / more, size, whole, read)]
+    return _Fit(len(problem.prior), phi / more, size, whole, read)
 
 
 def _minutes(cell: Cell, q: Array, readings: IntArray) -> float:

@@ -307,7 +307,7 @@ def plan_arm(plan: Plan) -> say.Figure:
         about = [f"stop {order[k]}", *([group] if plan.level_joint else []), told]
         markers, names = local @ T[:3, :3].T + T[:3, 3], tuple(cell.tool.markers)
         poses.append(
-            Posed(plan.configurations[k], "; ".join(about), frames[k], T, markers, names, None,
+            Posed(plan.names[k], "; ".join(about), frames[k], T, markers, names, None,
                   int(plan.group[k]))
         )  # fmt: skip
     space = Space(cell, chain, poses, groups=plan.group_names)

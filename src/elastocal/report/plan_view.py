@@ -36,7 +36,7 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     two, one, none = (pose_table(plan, decimals) for decimals in (2, 1, 0))
     poses = replace(two, narrow=replace(one, narrow=none))
     yield say.Fold("Poses", lambda: [poses], printed=True)
-    why = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
+    why = [(name, served(r)) for name, r in zip(plan.names, plan.reasons, strict=True)]
     reasons = say.ShownTable(("pose", SERVES), why, (1,), title="Why each pose")
     yield say.Fold("Why each pose", lambda: [reasons], printed=True)
     yield say.Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
@@ -102,7 +102,7 @@ SERVES = "most affected if dropped (standard deviation)"
 def pose_table(plan: Plan, decimals: int = 2) -> say.ShownTable:
     kinds, each = plan.model.chain.kinds, range(len(plan))
     joints = zip(*(say.joint_texts(q, kinds, decimals) for q in plan.q), strict=True)
-    columns: dict[str, Sequence[str]] = {"pose": plan.configurations}
+    columns: dict[str, Sequence[str]] = {"pose": plan.names}
     columns |= dict(zip(say.joint_heads(kinds), joints, strict=True))
     order = say.first_stops(plan)
     columns["order"] = [str(order[k]) for k in each]
@@ -147,7 +147,7 @@ def stop_table(plan: Plan) -> say.ShownTable:
         rows += via(k + 1)
         change = ", to change" * (stop.change_after is not None)
         load = [f"{' '.join(f'{f:g}' for f in plan.forces[stop.load])}{change}"] if loads else []
-        rows.append((str(k + 1), stop.name(plan.configurations), *load, f"{now / 60:.0f}", "☐"))
+        rows.append((str(k + 1), stop.name(plan.names), *load, f"{now / 60:.0f}", "☐"))
     rows += via(None)
     heads = ("stop", "pose", *(["load in N"] if loads else []), "minute", "done")
     return say.ShownTable(heads, rows, (1, 2) if loads else (1,), title="Stops in order")

@@ -466,7 +466,7 @@ def _estimates(result: Calibration) -> list[dict[str, Any]]:
 def _plan_frame(plan: Plan | None) -> dict[str, Any]:
     if plan is None:
         return {}
-    columns: dict[str, Any] = {"configuration": list(plan.configurations)}
+    columns: dict[str, Any] = {"configuration": list(plan.names)}
     kinds = plan.model.chain.kinds
     columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
     if plan.level_joint is not None:

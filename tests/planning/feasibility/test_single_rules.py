@@ -238,7 +238,7 @@ def test_what_reaches_below_it_is_left_out_and_nothing_else() -> None:
     q = kr270_poses(3000)
     broken = rules.check(q, NOTHING)
     low = heights(q).min(axis=1)
-    assert broken.removed_by["mounting_plane"] == (~broken.ok).sum() > 100
+    assert broken.counts.removed_by["mounting_plane"] == (~broken.ok).sum() > 100
     assert (low[broken.ok] > 0).all()
     assert (low[~broken.ok] < 0.002).all()
 

@@ -46,7 +46,7 @@ def rows_of(execution, names, stated=None):
     cell = SimpleNamespace(tool=SimpleNamespace(markers={}))
     model = SimpleNamespace(chain=SimpleNamespace(kinds=("revolute",) * 2), cell=cell)
     plan = SimpleNamespace(
-        execution=execution, configurations=names, model=model, forces=BOTH, stated_forces=stated,
+        execution=execution, names=names, model=model, forces=BOTH, stated_forces=stated,
         group=np.zeros(len(names), dtype=int), seen=None, crossed=True,
     )  # fmt: skip
     return Plan.rows.fget(plan)
