@@ -549,54 +549,33 @@ def only_placed(result: Calibration) -> bool:
 
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
-    "copied_readings": (
-        "Readings that repeat others to the last digit were excluded ({lines}): copies add no "
-        "information and make intervals too narrow. {remedy}"
-    ),
-    "impossible_values": (
-        "Impossible values: {parameters} beyond a physical bound by more than 5 standard "
-        "deviations."
-    ),
+    "copied_readings": "Readings that repeat others to the last digit were excluded ({lines}): "
+    "copies add no information and make intervals too narrow. {remedy}",
+    "impossible_values": "Impossible values: {parameters} beyond a physical bound by more than 5 "
+    "standard deviations.",
     **dict.fromkeys(("load_unit", "exchanged_markers", "scatter_not_counted"), "{remedy}"),
     "not_converged": "The fit did not converge: {reason}. {remedy}",
-    "few_degrees_of_freedom": (
-        "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
-        "and the residual is too small. {remedy}"
-    ),
-    "not_held_out": (
-        "Some configuration alone determines a parameter, so there is no held-out error for "
-        "it. Measure more configurations."
-    ),
-    "ill_conditioned": (
-        "Ill-conditioned (condition number {condition_number} after scaling): the data barely "
-        "separate {parameters}. {remedy}"
-    ),
-    "residual_above_stated_noise": (
-        "The residual is {ratio:.1f} times the stated noise: an effect is missing or the stated "
-        "noise is too small. Intervals use the residual, not the stated noise. {look}."
-    ),
-    "lack_of_fit": (
-        "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
-        "and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
-        "place, or an effect is missing. The intervals do not include it and are too narrow: "
-        "{use}measure more configurations rather than more repeats."
-    ),
-    "drift": (
-        "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
-        "{by}; {p}). Weights and intervals account for it, and whole blocks in time are "
-        "held out. {remedy}"
-    ),
-    "joint_scatter": (
-        "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
-        "{p}). Weights and intervals account for it. {remedy}"
-    ),
-    "beyond_bound": (
-        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: {remedy}"
-    ),
-    "many_faulty_readings": (
-        "Too many for reading errors: a shifted block of readings, or a missing effect in some "
-        "load state, marker or region. {remedy}"
-    ),
+    "few_degrees_of_freedom": "Only {dof} degrees of freedom for {parameters} determined "
+    "parameters: intervals are wide and the residual is too small. {remedy}",
+    "not_held_out": "Some configuration alone determines a parameter, so there is no held-out "
+    "error for it. Measure more configurations.",
+    "ill_conditioned": "Ill-conditioned (condition number {condition_number} after scaling): the "
+    "data barely separate {parameters}. {remedy}",
+    "residual_above_stated_noise": "The residual is {ratio:.1f} times the stated noise: an effect "
+    "is missing or the stated noise is too small. Intervals use the residual, not the stated "
+    "noise. {look}.",
+    "lack_of_fit": "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on "
+    "{dof_between} and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
+    "place, or an effect is missing. The intervals do not include it and are too narrow: "
+    "{use}measure more configurations rather than more repeats.",
+    "drift": "Base or tracker drift during the session ({sigma_um} µm{along}, by the {by}; {p}). "
+    "Weights and intervals account for it, and whole blocks in time are held out. {remedy}",
+    "joint_scatter": "The joints settle anew at every visit of the arm (standard deviation "
+    "{sigma_urad} µrad; {p}). Weights and intervals account for it. {remedy}",
+    "beyond_bound": "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: "
+    "{remedy}",
+    "many_faulty_readings": "Too many for reading errors: a shifted block of readings, or a "
+    "missing effect in some load state, marker or region. {remedy}",
 }
 DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
 # The same of several parameters, whose names are told together.

@@ -70,10 +70,8 @@ def _doubt(f: Finding) -> str:
 
 DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "not_converged": "the fit did not converge ({reason})",
-    "no_better_than_nominal": (
-        "the held-out error ({heldout_rms_um} rms) is not below that of the nominal arm "
-        "({nominal_rms_um})"
-    ),
+    "no_better_than_nominal": "the held-out error ({heldout_rms_um} rms) is not below that of the "
+    "nominal arm ({nominal_rms_um})",
     "not_held_out": lambda f: (
         "there is no held-out error: some pose alone determines a parameter, and nothing checks it"
         + (
@@ -83,14 +81,10 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         )
     ),
     "residual_above_stated_noise": "the residual is {ratio} times the stated noise",
-    "residual_below_stated_noise": (
-        "the stated noise is too large (the residual is {ratio} times it), so a missing effect "
-        "would not show"
-    ),
-    "common_noise_too_large": (
-        "what is stated as common to a configuration is too large (configurations scatter {ratio} "
-        "times as much), so a missing effect would not show"
-    ),
+    "residual_below_stated_noise": "the stated noise is too large (the residual is {ratio} times "
+    "it), so a missing effect would not show",
+    "common_noise_too_large": "what is stated as common to a configuration is too large "
+    "(configurations scatter {ratio} times as much), so a missing effect would not show",
     "residuals_heavy_tailed": lambda f: (
         "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
@@ -122,10 +116,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters "
         f"(needed: {f.numbers['needed']})"
     ),
-    "noise_unknown": (
-        "the noise level is unknown (neither stated nor repeated), so the residual may hide a "
-        "missing effect"
-    ),
+    "noise_unknown": "the noise level is unknown (neither stated nor repeated), so the residual "
+    "may hide a missing effect",
     "new_poses_not_shown": lambda f: (
         f"{_length(f, 'open_um')} of the error at new poses comes from parameters that the "
         f"measured poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
@@ -139,10 +131,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "many_left_out": "{left_out} readings are excluded as outliers, and {fitted} are fitted",
     "drift": "base or tracker drift by {sigma_um} during the measurement session",
     "test_data_worse": "the test error ({test_rms_um} rms) is larger than chance explains",
-    "test_data_far": (
-        "{far} of {configurations} test poses are more uncertain than every measured pose "
-        "({predicted_std_um} rms over all test poses, at most {fitted_std_um} at measured ones)"
-    ),
+    "test_data_far": "{far} of {configurations} test poses are more uncertain than every measured "
+    "pose ({predicted_std_um} rms over all test poses, at most {fitted_std_um} at measured ones)",
 }
 
 
@@ -211,10 +201,8 @@ METHODS = {
     "ols": "ordinary least squares, all readings weighted alike",
     "wls": "weighted least squares",
     "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
-    "eq14-residual": (
-        "weighted least squares as published, weights of eq. (14) from each residual, iterated; "
-        "it acts like a robust fit, and its stated intervals are far too narrow"
-    ),
+    "eq14-residual": "weighted least squares as published, weights of eq. (14) from each residual, "
+    "iterated; it acts like a robust fit, and its stated intervals are far too narrow",
     "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
     "l1": "least sum of residual lengths (L1), robust like the median",
 }
@@ -315,10 +303,8 @@ COMPARED = (  # the first is against the noise that is stated
 )
 SHAPES = {
     "residuals_skew": "errors are skewed, as with a missing effect.",
-    "residuals_heavy_tailed": (
-        "large errors are more frequent. A robust method (huber, l1) shows "
-        "whether the estimates depend on them."
-    ),
+    "residuals_heavy_tailed": "large errors are more frequent. A robust method (huber, l1) shows "
+    "whether the estimates depend on them.",
     "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",
 }
 
