@@ -572,16 +572,10 @@ SENTENCES = {
     "Weights and intervals account for it, and whole blocks in time are held out. {remedy}",
     "joint_scatter": "The joints settle anew at every visit of the arm (standard deviation "
     "{sigma_urad} µrad; {p}). Weights and intervals account for it. {remedy}",
-    "beyond_bound": "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: "
-    "{remedy}",
     "many_faulty_readings": "Too many for reading errors: a shifted block of readings, or a "
     "missing effect in some load state, marker or region. {remedy}",
 }
 DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
-# The same of several parameters, whose names are told together.
-OF_SEVERAL = {
-    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}"
-}
 
 
 def warning_sentences(result: Calibration) -> dict[str, str]:
@@ -589,7 +583,8 @@ def warning_sentences(result: Calibration) -> dict[str, str]:
     sentence."""
     groups: dict[Any, list[Finding]] = {}
     for k, f in enumerate(result.findings):
-        alike = (f.kind, f.numbers["bound"], f.numbers["unit"]) if f.kind in OF_SEVERAL else k
+        beyond = f.kind == "beyond_bound"
+        alike = (f.numbers["bound"], f.numbers["unit"]) if beyond else k
         groups.setdefault(alike, []).append(f)
     return {text: same[0].kind for same in groups.values() for text in _told(result, same)}
 
@@ -617,30 +612,33 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         }  # fmt: skip
         words["along"] = "" if result.model.observe == "distance" else " in each direction"
         words["p"] = size_of(f.number("p")) if "p" in words else ""
-        within = f.kind == "beyond_bound"  # there the remedy ends a sentence
-        words |= _shown(f) if within else {}
         default = "the default method, whose noise model has this scatter"
         use = [default] * (not result.noise.estimated)
         use += ["intervals by cr2"] * (not (result.prior_share or result.active))
         words["use"] = f"use {', or '.join(use)}; " if use else ""
         ask = f.remedy.startswith("Ask")
         words["look"] = "Look for missing effects (diagnose)" if ask else "Repeat some poses"
-        words["remedy"] = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
+        words["remedy"] = f.remedy
         if f.kind == "copied_readings":
             words["lines"] = _runs(result.copies)
-        if len(same) == 1:
-            yield SENTENCES[f.kind].format(**words)
-            return
-        pairs = ("{value} ± {std}".format(**_shown(other)) for other in same)
-        words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
-        yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
+        yield SENTENCES[f.kind].format(**words)
+    elif f.kind == "beyond_bound":
+        yield _beyond(same)
 
 
-def _shown(f: Finding) -> dict[str, str]:
-    unit = str(f.numbers["unit"])
-    digits = {"value": 3, "std": 2, "bound": 3}
-    sizes = {k: rounded(display(f.number(k), unit)[0], n) for k, n in digits.items()}
-    return sizes | {"unit": display(0.0, unit)[1]}
+def _beyond(same: list[Finding]) -> str:
+    """Of parameters beyond one bound."""
+    names, unit = [f.numbers["parameter"] for f in same], str(same[0].numbers["unit"])
+    values, stds, (bound, *_) = (
+        [rounded(display(f.number(name), unit)[0], digits) for f in same]
+        for name, digits in (("value", 3), ("std", 2), ("bound", 3))
+    )
+    unit, remedy = display(0.0, unit)[1], same[0].remedy
+    each = listed(map("{} ± {}".format, values, stds), 4)
+    text = f"{gathered(names)} lie beyond their physical bound {bound} {unit} ({each})"
+    if len(same) == 1:
+        text = f"{names[0]} = {each} {unit} lies beyond its physical bound {bound}"
+    return f"{text}: {remedy[:1].lower()}{remedy[1:]}"
 
 
 def _runs(lines: Iterable[int]) -> str:
@@ -650,7 +648,7 @@ def _runs(lines: Iterable[int]) -> str:
 
 
 # Of these the warning says what to do.
-TOLD_ELSEWHERE = {kind for kind, text in SENTENCES.items() if "{remedy}" in text}
+TOLD_ELSEWHERE = {"beyond_bound"} | {kind for kind, text in SENTENCES.items() if "{remedy}" in text}
 
 
 SLIGHT = 0.1  # of the error at new poses: what is open by less raises it by half a percent
