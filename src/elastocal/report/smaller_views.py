@@ -82,31 +82,19 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         verdict = "The arm has changed, but no single parameter is significant."
     yield say.ShownVerdict(tone, verdict)
     loads = say.loads_text(c.forces, "{}", "{} loads in turn")
-    moved = (
-        f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
-        f"poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone gives "
-        f"{noise} rms."
-    )
-    chance = (
-        f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by Holm's rule: "
-        f"if nothing has changed, the probability of any finding is {c.level:g} at most."
-    )
-    compared = [
-        "The arm itself. Base and markers are set up anew each time: a change that a motion of the "
-        "base or the markers also explains is not seen."
-    ]
-    if c.first_order:
-        compared.append(
-            "The sessions determined different parameters; what both show is compared, to first "
-            "order."
-        )
-    if mostly:
-        compared.append(
-            "A change of what is determined mostly by a prior is hardly seen, and its part of the "
-            f"noise is that of the prior: {some(mostly, 8)}."
-        )
     yield say.Lines([
-        ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
+        ("Tool", f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} "
+         f"random poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone "
+         f"gives {noise} rms."),
+        ("Chance", f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by "
+         "Holm's rule: if nothing has changed, the probability of any finding is "
+         f"{c.level:g} at most."),
+        ("Compared", "The arm itself. Base and markers are set up anew each time: a change that a "
+         "motion of the base or the markers also explains is not seen."),
+        ("Compared", "The sessions determined different parameters; what both show is compared, to "
+         "first order." if c.first_order else None),
+        ("Compared", "A change of what is determined mostly by a prior is hardly seen, and its "
+         f"part of the noise is that of the prior: {some(mostly, 8)}." if mostly else None),
         *(("Not compared", printable(f"{some(names, 8)} ({why})."))
           for why, names in c.not_compared.items()),
         *(("Next", step) for step in steps),
@@ -435,7 +423,7 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         each = {name: dict.fromkeys(np.atleast_1d(v).tolist()) for name, v in vars(stated).items()}
         noise = ", ".join(
             f"{name.replace('_', ' ')} {', '.join(map(say.length, sizes))}"
-            + (" per m" if name.endswith("per_m") else "")
+            f"{' per m' * name.endswith('per_m')}"
             for name, sizes in each.items()
         )
     facts = [
