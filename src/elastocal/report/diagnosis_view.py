@@ -400,7 +400,6 @@ def untested_table(d: Diagnosis) -> say.ShownTable:
 
 
 def location_table(d: Diagnosis) -> say.ShownTable:
-    """The stages of the chain from commanded joints to tracker, and the likeliest places."""
     if (location := d.location) is None:
         return say.ShownTable((), [])
     found = location.shares or location.stages

@@ -330,23 +330,17 @@ def does_noise_explain_it(result: Calibration) -> str:
             of = "reading" if observed.kind == "distance" else "coordinate"
             return f"{text}; the residual amounts to {say.length(result.noise.sigma)} per {of}."
         return f"{text}{'; the noise level was estimated from the readings' * estimated}."
-    size = (
-        f"{say.significant(f.number('ratio'))} times the stated noise; chance alone gives "
-        f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
-    )
+    size = f"{say.significant(f.number('ratio'))} times the stated noise; chance alone gives "
+    size += f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
     if f.kind == "residual_agrees_with_stated_noise":
         return f"The residual agrees with the stated noise ({size})."
     single = result.finding("stated_noise_too_small")
     if f.kind == "residual_agrees_with_readings" and single is not None:
-        text = (
-            f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
-            f"scatter by {say.significant(single.number('ratio'))} times the stated noise."
-        )
+        text = f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
+        text += f"scatter by {say.significant(single.number('ratio'))} times the stated noise."
     elif f.kind == "residual_above_stated_noise":
-        text = (
-            f"The residual is larger than the stated noise explains ({size}): an effect is "
-            "missing, or the noise is larger than stated."
-        )
+        text = f"The residual is larger than the stated noise explains ({size}): an effect is "
+        text += "missing, or the noise is larger than stated."
     else:
         text = f"The residual is smaller than the stated noise ({size}), which is too large."
     return text + " Weights and intervals use the estimated noise." * estimated
@@ -402,10 +396,8 @@ def repeats_line(result: Calibration) -> str | None:
     f = result.finding("lack_of_fit", "repeats_agree")
     if f is None:
         return None
-    numbers = (
-        f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
-        f"{f.numbers['dof_pure']} degrees of freedom, {say.size_of(f.number('p'))}"
-    )
+    numbers = f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
+    numbers += f"{f.numbers['dof_pure']} degrees of freedom, {say.size_of(f.number('p'))}"
     by = str(f.numbers["counted_by"])
     if f.kind == "repeats_agree":
         text = f"Repeats agree with the scatter between configurations ({numbers})"
@@ -428,9 +420,8 @@ def repeats_line(result: Calibration) -> str | None:
 
 def shape_line(summary: ResidualSummary) -> str:
     f = shape_of(summary)
-    numbers = (
-        f"skewness {f.number('skewness'):+.2f}, excess kurtosis {f.number('excess_kurtosis'):+.2f}"
-    )
+    numbers = f"skewness {f.number('skewness'):+.2f}, excess "
+    numbers += f"kurtosis {f.number('excess_kurtosis'):+.2f}"
     if f.kind == "residuals_too_few":
         text = f"Too few values to judge whether residuals are normal ({numbers})."
     else:
@@ -439,10 +430,8 @@ def shape_line(summary: ResidualSummary) -> str:
         if f.kind != "residuals_normal":
             text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
     if (scatter := summary.whole.held_out_mean_square) is not None:
-        text += (
-            f" In held-out configurations the scatter is {say.significant(scatter**0.5)} times "
-            "that of the noise model."
-        )
+        text += f" In held-out configurations the scatter is {say.significant(scatter**0.5)} times "
+        text += "that of the noise model."
     groups = [f"{row[0]} {row[2]} times" for row in deviating_table(summary).rows[:MOST_GROUPS]]
     if not groups:
         return f"{text} No group of readings deviates from the noise model."
@@ -467,8 +456,8 @@ def in_time_line(result: Calibration) -> str | None:
         return None
     numbers = (
         f"correlation {found.correlations[0]:+.2f} over {found.visits} visits in the order of "
-        f"{'their times' if found.by == 'times' else 'the rows'}, {say.size_of(found.p)}"
     )
+    numbers += f"{'their times' if found.by == 'times' else 'the rows'}, {say.size_of(found.p)}"
     told = result.finding("autocorrelated")
     which = "Residuals of successive visits are"
     if told is None:

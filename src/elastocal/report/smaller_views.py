@@ -397,14 +397,13 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
     certified = Certified(result, budget)
     yield judgement(result)
-    told = [
-        (name.replace("_", " "), printable(value))
-        for name, value in vars(entries).items() if isinstance(value, str)
-    ]  # fmt: skip
-    if entries.temperature is not None:
-        told.append(("temperature", f"{entries.temperature:g} °C"))
-    if (own := entries.instrument_uncertainty) is not None:
-        told.append(("instrument's expanded uncertainty, k = 2", say.length(own)))
+    degrees, own = entries.temperature, entries.instrument_uncertainty
+    told = say.Lines([
+        *((name.replace("_", " "), printable(value))
+          for name, value in vars(entries).items() if isinstance(value, str)),
+        ("temperature", None if degrees is None else f"{degrees:g} °C"),
+        ("instrument's expanded uncertainty, k = 2", None if own is None else say.length(own)),
+    ]).items  # fmt: skip
     yield say.ShownTable(("entry", ""), told, (0, 1), title="Entries")
     if told and entries.missing:
         yield say.Sentence(
@@ -426,7 +425,7 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
             f"{' per m' * name.endswith('per_m')}"
             for name, sizes in each.items()
         )
-    facts = [
+    facts = say.Lines([
         ("Robot", printable(result.model.chain.name)),
         ("Joints", names_told(result.model.chain)),
         ("Instrument, standard deviations", noise),
@@ -436,9 +435,8 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         ("Method", say.sentence(method_and_weights(result))),
         ("Expected error", fitted.at_new_poses(result.predicted)),
         ("Prediction", fitted.prediction_line(result)),
-    ]
-    title = "What was calibrated, and by what"
-    yield say.ShownTable(("what", ""), say.Lines(facts).items, (0, 1), title=title)
+    ]).items  # fmt: skip
+    yield say.ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
 
 
 class Certified:
@@ -546,9 +544,8 @@ def _poses(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Bloc
             soft=True,
         )
     else:
-        yield say.Sentence(
-            "Pose accuracy is not known: no configuration can be left out of the fit."
-        )
+        none = "no configuration can be left out of the fit"
+        yield say.Sentence(f"Pose accuracy is not known: {none}.")
     if len(rp := pose_repeatability(result)):
         yield say.Sentence(
             f"Pose repeatability RP (ISO 9283): {say.length(float(rp.mean()))} in the mean of "
