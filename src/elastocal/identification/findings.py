@@ -183,12 +183,10 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     single = result.noise.single
     if single is not None and single.above:
         times = ratio if single.explains else single.ratio
-        remedy = (
-            f"Correct [tracker]: by {single.by} single readings scatter {rounded(times, 2)} times "
-            "as much as cell or table state."
-        )
         yield _note(
-            "stated_noise_too_small", remedy,
+            "stated_noise_too_small",
+            f"Correct [tracker]: by {single.by} single readings scatter {rounded(times, 2)} times "
+            "as much as cell or table state.",
             ratio=single.ratio, dof=single.dof, by=single.by, p_rest=single.rest,
         )  # fmt: skip
     say, kind, doing = _good, "residual_agrees_with_stated_noise", None
@@ -389,11 +387,9 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
         remedy = f"Check the {counted(n, 'reading')} beyond the noise."
         shifted = result.faulty_report.shifted if result.faulty_report else []
         if shifted:
-            remedy += (
-                f" One common shift{' each' * (len(shifted) > 1)} explains "
-                f"{listed(map(str, shifted), 4)}: look for what "
-                "moved there, a marker or the tracker."
-            )
+            remedy += f" One common shift{' each' * (len(shifted) > 1)} explains "
+            remedy += f"{listed(map(str, shifted), 4)}: look for what moved there, a marker or the "
+            remedy += "tracker."
         if many:
             lines = [o.line for o in result.excluded]
             sound = result.observations.table.row[result.observations.lead]

@@ -94,7 +94,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: residuals().others(),
+        lambda: _on_the_arm(residuals()),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -130,6 +130,13 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
         yield found
+
+
+def _on_the_arm(residuals: Residuals) -> Iterator[say.Block]:
+    from elastocal.report.arm_view import residual_arm
+
+    yield residual_arm(*residuals.fit)
+    yield from residuals.others()
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:
@@ -179,10 +186,8 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
         for a, b, r in result.correlations[:MOST_CORRELATIONS]
     ]
     more = len(result.correlations) - len(rows)
-    note = (
-        "Such parameters are known far better together than each alone: the intervals count with "
-        "it, and so does every prediction."
-    )
+    note = "Such parameters are known far better together than each alone: the intervals count "
+    note += "with it, and so does every prediction."
     note += f" {more} more are in the result's file." if more else ""
     return say.ShownTable(("parameter", "and", "correlation"), rows, (0, 1), note=note)
 

@@ -522,10 +522,8 @@ def _uncertainty(certified: Certified) -> Iterator[say.Block]:
     rows.append(("expanded, U with k = 2", "", say.length(K * math.sqrt(square)), ""))
     heads = ("source", "type", "standard uncertainty", "share of the variance")
     of_what = "coordinate of a position" if certified.coordinates == 3 else "distance"
-    note = (
-        f"Of a {of_what} that the calibrated model predicts, against one reading (GUM, JCGM 100). "
-        "U covers about 95 %."
-    )
+    note = f"Of a {of_what} that the calibrated model predicts, against one reading (GUM, JCGM "
+    note += "100). U covers about 95 %."
     if all(name != INSTRUMENT for name, *_ in sources):
         note += " Without the instrument's own calibration, which [certificate] does not state."
     yield say.ShownTable(heads, rows, (0, 1), title="Uncertainty", note=note)
