@@ -351,7 +351,8 @@ def noise_model_line(result: Calibration) -> str | None:
     sizes, reason = _sizes(noise), noise.reason
     if not sizes and not reason:
         return None
-    text = say.capital(printable(noise.description))
+    text = printable(noise.description)
+    text = text[:1].upper() + text[1:]
     text += f": {'; '.join(sizes)}" if sizes else ""
     candidates = candidate_table(noise).rows
     if (n := len(candidates)) > 1:
