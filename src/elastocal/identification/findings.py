@@ -183,12 +183,10 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     single = result.noise.single
     if single is not None and single.above:
         times = ratio if single.explains else single.ratio
-        remedy = (
-            f"Correct [tracker]: by {single.by} single readings scatter {rounded(times, 2)} times "
-            "as much as cell or table state."
-        )
         yield _note(
-            "stated_noise_too_small", remedy,
+            "stated_noise_too_small",
+            f"Correct [tracker]: by {single.by} single readings scatter {rounded(times, 2)} times "
+            "as much as cell or table state.",
             ratio=single.ratio, dof=single.dof, by=single.by, p_rest=single.rest,
         )  # fmt: skip
     say, kind, doing = _good, "residual_agrees_with_stated_noise", None
@@ -389,11 +387,9 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
         remedy = f"Check the {counted(n, 'reading')} beyond the noise."
         shifted = result.faulty_report.shifted if result.faulty_report else []
         if shifted:
-            remedy += (
-                f" One common shift{' each' * (len(shifted) > 1)} explains "
-                f"{listed(map(str, shifted), 4)}: look for what "
-                "moved there, a marker or the tracker."
-            )
+            remedy += f" One common shift{' each' * (len(shifted) > 1)} explains "
+            remedy += f"{listed(map(str, shifted), 4)}: look for what moved there, a marker or the "
+            remedy += "tracker."
         if many:
             lines = [o.line for o in result.excluded]
             sound = result.observations.table.row[result.observations.lead]
@@ -549,60 +545,33 @@ def only_placed(result: Calibration) -> bool:
 
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
-    "copied_readings": (
-        "Readings that repeat others to the last digit were excluded ({lines}): copies add no "
-        "information and make intervals too narrow. {remedy}"
-    ),
-    "impossible_values": (
-        "Impossible values: {parameters} beyond a physical bound by more than 5 standard "
-        "deviations."
-    ),
+    "copied_readings": "Readings that repeat others to the last digit were excluded ({lines}): "
+    "copies add no information and make intervals too narrow. {remedy}",
+    "impossible_values": "Impossible values: {parameters} beyond a physical bound by more than 5 "
+    "standard deviations.",
     **dict.fromkeys(("load_unit", "exchanged_markers", "scatter_not_counted"), "{remedy}"),
     "not_converged": "The fit did not converge: {reason}. {remedy}",
-    "few_degrees_of_freedom": (
-        "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
-        "and the residual is too small. {remedy}"
-    ),
-    "not_held_out": (
-        "Some configuration alone determines a parameter, so there is no held-out error for "
-        "it. Measure more configurations."
-    ),
-    "ill_conditioned": (
-        "Ill-conditioned (condition number {condition_number} after scaling): the data barely "
-        "separate {parameters}. {remedy}"
-    ),
-    "residual_above_stated_noise": (
-        "The residual is {ratio:.1f} times the stated noise: an effect is missing or the stated "
-        "noise is too small. Intervals use the residual, not the stated noise. {look}."
-    ),
-    "lack_of_fit": (
-        "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
-        "and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
-        "place, or an effect is missing. The intervals do not include it and are too narrow: "
-        "{use}measure more configurations rather than more repeats."
-    ),
-    "drift": (
-        "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
-        "{by}; {p}). Weights and intervals account for it, and whole blocks in time are "
-        "held out. {remedy}"
-    ),
-    "joint_scatter": (
-        "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
-        "{p}). Weights and intervals account for it. {remedy}"
-    ),
-    "beyond_bound": (
-        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: {remedy}"
-    ),
-    "many_faulty_readings": (
-        "Too many for reading errors: a shifted block of readings, or a missing effect in some "
-        "load state, marker or region. {remedy}"
-    ),
+    "few_degrees_of_freedom": "Only {dof} degrees of freedom for {parameters} determined "
+    "parameters: intervals are wide and the residual is too small. {remedy}",
+    "not_held_out": "Some configuration alone determines a parameter, so there is no held-out "
+    "error for it. Measure more configurations.",
+    "ill_conditioned": "Ill-conditioned (condition number {condition_number} after scaling): the "
+    "data barely separate {parameters}. {remedy}",
+    "residual_above_stated_noise": "The residual is {ratio:.1f} times the stated noise: an effect "
+    "is missing or the stated noise is too small. Intervals use the residual, not the stated "
+    "noise. {look}.",
+    "lack_of_fit": "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on "
+    "{dof_between} and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
+    "place, or an effect is missing. The intervals do not include it and are too narrow: "
+    "{use}measure more configurations rather than more repeats.",
+    "drift": "Base or tracker drift during the session ({sigma_um} µm{along}, by the {by}; {p}). "
+    "Weights and intervals account for it, and whole blocks in time are held out. {remedy}",
+    "joint_scatter": "The joints settle anew at every visit of the arm (standard deviation "
+    "{sigma_urad} µrad; {p}). Weights and intervals account for it. {remedy}",
+    "many_faulty_readings": "Too many for reading errors: a shifted block of readings, or a "
+    "missing effect in some load state, marker or region. {remedy}",
 }
 DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
-# The same of several parameters, whose names are told together.
-OF_SEVERAL = {
-    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}"
-}
 
 
 def warning_sentences(result: Calibration) -> dict[str, str]:
@@ -610,7 +579,8 @@ def warning_sentences(result: Calibration) -> dict[str, str]:
     sentence."""
     groups: dict[Any, list[Finding]] = {}
     for k, f in enumerate(result.findings):
-        alike = (f.kind, f.numbers["bound"], f.numbers["unit"]) if f.kind in OF_SEVERAL else k
+        beyond = f.kind == "beyond_bound"
+        alike = (f.numbers["bound"], f.numbers["unit"]) if beyond else k
         groups.setdefault(alike, []).append(f)
     return {text: same[0].kind for same in groups.values() for text in _told(result, same)}
 
@@ -638,30 +608,33 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         }  # fmt: skip
         words["along"] = "" if result.model.observe == "distance" else " in each direction"
         words["p"] = size_of(f.number("p")) if "p" in words else ""
-        within = f.kind == "beyond_bound"  # there the remedy ends a sentence
-        words |= _shown(f) if within else {}
         default = "the default method, whose noise model has this scatter"
         use = [default] * (not result.noise.estimated)
         use += ["intervals by cr2"] * (not (result.prior_share or result.active))
         words["use"] = f"use {', or '.join(use)}; " if use else ""
         ask = f.remedy.startswith("Ask")
         words["look"] = "Look for missing effects (diagnose)" if ask else "Repeat some poses"
-        words["remedy"] = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
+        words["remedy"] = f.remedy
         if f.kind == "copied_readings":
             words["lines"] = _runs(result.copies)
-        if len(same) == 1:
-            yield SENTENCES[f.kind].format(**words)
-            return
-        pairs = ("{value} ± {std}".format(**_shown(other)) for other in same)
-        words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
-        yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
+        yield SENTENCES[f.kind].format(**words)
+    elif f.kind == "beyond_bound":
+        yield _beyond(same)
 
 
-def _shown(f: Finding) -> dict[str, str]:
-    unit = str(f.numbers["unit"])
-    digits = {"value": 3, "std": 2, "bound": 3}
-    sizes = {k: rounded(display(f.number(k), unit)[0], n) for k, n in digits.items()}
-    return sizes | {"unit": display(0.0, unit)[1]}
+def _beyond(same: list[Finding]) -> str:
+    """Of parameters beyond one bound."""
+    names, unit = [f.numbers["parameter"] for f in same], str(same[0].numbers["unit"])
+    values, stds, (bound, *_) = (
+        [rounded(display(f.number(name), unit)[0], digits) for f in same]
+        for name, digits in (("value", 3), ("std", 2), ("bound", 3))
+    )
+    unit, remedy = display(0.0, unit)[1], same[0].remedy
+    each = listed(map("{} ± {}".format, values, stds), 4)
+    text = f"{gathered(names)} lie beyond their physical bound {bound} {unit} ({each})"
+    if len(same) == 1:
+        text = f"{names[0]} = {each} {unit} lies beyond its physical bound {bound}"
+    return f"{text}: {remedy[:1].lower()}{remedy[1:]}"
 
 
 def _runs(lines: Iterable[int]) -> str:
@@ -671,7 +644,7 @@ def _runs(lines: Iterable[int]) -> str:
 
 
 # Of these the warning says what to do.
-TOLD_ELSEWHERE = {kind for kind, text in SENTENCES.items() if "{remedy}" in text}
+TOLD_ELSEWHERE = {"beyond_bound"} | {kind for kind, text in SENTENCES.items() if "{remedy}" in text}
 
 
 SLIGHT = 0.1  # of the error at new poses: what is open by less raises it by half a percent

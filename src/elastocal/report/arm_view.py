@@ -287,10 +287,8 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
         f"them. The arm is drawn as {space.drawn_from}."
     )
     if len(poses) < observed.n_configurations:
-        text += (
-            f" {len(poses)} poses of {observed.n_configurations} configurations: those with the "
-            "largest residuals, and a random choice."
-        )
+        text += f" {len(poses)} poses of {observed.n_configurations} configurations: those with "
+        text += "the largest residuals, and a random choice."
     return posed("space", "Residuals as arrows on the posed arm", text, space)
 
 
@@ -311,11 +309,9 @@ def plan_arm(plan: Plan) -> say.Figure:
                   int(plan.group[k]))
         )  # fmt: skip
     space = Space(cell, chain, poses, groups=plan.group_names)
-    caption = (
-        "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
-        f"{space.drawn_from}."
-    )
-    return posed("poses", "The arm in the poses of the plan", caption, space)
+    title = "The arm in the poses of the plan"
+    caption = f"{title}, numbered at the flange. The arm is drawn as {space.drawn_from}."
+    return posed("poses", title, caption, space)
 
 
 MOST_NUMBERED = 80  # beyond that numbers hide each other

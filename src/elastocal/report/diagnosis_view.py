@@ -91,10 +91,12 @@ def _figures(d: Diagnosis) -> Iterator[say.Figure]:
 
 
 def _residuals(base: Baseline) -> Iterator[say.Block]:
+    from elastocal.report.arm_view import residual_arm
+
     residuals = Residuals(base.model, base.observed, base.x, base.residual)
-    arm, *others = residuals.others()
     yield say.Sentence("What the model leaves before the effects found are added.")
-    yield from (arm, *residuals.figures(), *others)
+    yield residual_arm(*residuals.fit)
+    yield from (*residuals.figures(), *residuals.others())
 
 
 def noise_floor_lines(
@@ -400,7 +402,6 @@ def untested_table(d: Diagnosis) -> say.ShownTable:
 
 
 def location_table(d: Diagnosis) -> say.ShownTable:
-    """The stages of the chain from commanded joints to tracker, and the likeliest places."""
     if (location := d.location) is None:
         return say.ShownTable((), [])
     found = location.shares or location.stages

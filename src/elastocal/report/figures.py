@@ -428,9 +428,6 @@ class Residuals:
         return self.by_configuration(), self.over_joints()
 
     def others(self) -> Iterator[say.Block]:
-        from elastocal.report.arm_view import residual_arm
-
-        yield residual_arm(*self.fit)
         if self.observed.table.time is not None:
             yield self.over_time(self.observed.table.time[self.observed.lead] / 60)
         yield self.table()

@@ -11,7 +11,6 @@ from functools import cache
 import numpy as np
 
 from elastocal.identification import findings
-from elastocal.identification.findings import next_steps
 from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
@@ -50,7 +49,7 @@ def calibration_blocks(
         *(("Reason", why) for why in words.reasons_of(result)),
         ("Error (rms)", error_line(result)),
         ("Expected", at_new_poses(result.predicted)),
-        *(("Next", f.remedy) for f in next_steps(result)),
+        *(("Next", f.remedy) for f in findings.next_steps(result)),
         *words.warnings_beside(result),
     ])  # fmt: skip
     yield say.Fold("", lambda: _error_figures(result, budget()), figures=("waterfall", "sureness"))
@@ -95,7 +94,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: residuals().others(),
+        lambda: _on_the_arm(residuals()),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -131,6 +130,13 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
         yield found
+
+
+def _on_the_arm(residuals: Residuals) -> Iterator[say.Block]:
+    from elastocal.report.arm_view import residual_arm
+
+    yield residual_arm(*residuals.fit)
+    yield from residuals.others()
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:
@@ -180,10 +186,8 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
         for a, b, r in result.correlations[:MOST_CORRELATIONS]
     ]
     more = len(result.correlations) - len(rows)
-    note = (
-        "Such parameters are known far better together than each alone: the intervals count with "
-        "it, and so does every prediction."
-    )
+    note = "Such parameters are known far better together than each alone: the intervals count "
+    note += "with it, and so does every prediction."
     note += f" {more} more are in the result's file." if more else ""
     return say.ShownTable(("parameter", "and", "correlation"), rows, (0, 1), note=note)
 
@@ -196,10 +200,8 @@ def what_was_identified(result: Calibration) -> str:
     text = f"{alone} of {say.counted(len(result.ordinary), 'parameter')}"
     text += f", {mostly} more mostly by a prior" * bool(mostly)
     if n:
-        text += (
-            f", and {say.counted(n, 'combination')} of parameters that these readings cannot "
-            f"separate ({count[findings.ABSORBED]} held in exchange)"
-        )
+        text += f", and {say.counted(n, 'combination')} of parameters that these readings cannot "
+        text += f"separate ({count[findings.ABSORBED]} held in exchange)"
     told = {
         **NO_VALUE, findings.INVISIBLE: "not visible in these data",
         findings.UNREAD: "of markers without a reading", findings.FIXED: "fixed by the user",
@@ -216,23 +218,20 @@ def what_was_identified(result: Calibration) -> str:
 
 
 def prediction_line(result: Calibration) -> str:
-    told: list[str] = []
-    held = math.isfinite(result.heldout_rms)
+    text, held = "", math.isfinite(result.heldout_rms)
     if not held:
-        told.append("No held-out error: some configuration alone determines a parameter.")
+        text = "No held-out error: some configuration alone determines a parameter. "
     elif result.noise.drift is not None:
-        told.append("Whole blocks in time were held out, with another day's drift.")
+        text = "Whole blocks in time were held out, with another day's drift. "
     if held and result.excluded:
-        told.append(
+        text += (
             f"With the {say.counted(len(result.excluded), 'reading')} excluded as outliers, the "
-            f"held-out error is {say.length(result.heldout_all_rms)} rms."
         )
+        text += f"held-out error is {say.length(result.heldout_all_rms)} rms. "
     if (t := result.test) is not None:
-        told.append(
-            f"Test error ({say.counted(t.n, 'reading')}, not fitted): {say.length(t.rms)} rms, "
-            f"{say.length(t.mean)} mean, {say.length(t.maximum)} maximum."
-        )
-    return " ".join(told)
+        text += f"Test error ({say.counted(t.n, 'reading')}, not fitted): {say.length(t.rms)} rms, "
+        text += f"{say.length(t.mean)} mean, {say.length(t.maximum)} maximum."
+    return text.rstrip()
 
 
 def at_new_poses(found: PredictedError | None) -> str:
@@ -280,7 +279,6 @@ def readings(result: Calibration) -> str:
 
 
 def nominal_held_out(result: Calibration) -> str:
-    """The nominal arm as the budget has it: base and markers placed by the other configurations."""
     placed = any(stage_of(p.effect) == 0 for p in result.model.parameters)
     return f"{NOMINAL}, held out" if placed else NOMINAL
 
@@ -392,7 +390,6 @@ def nominal_text(e: Estimate, parameter: Parameter) -> str:
 
 
 def undetermined_lines(result: Calibration, most: int | None = None) -> Iterator[str]:
-    """Which parameters have no number of their own, and why; `most` names a line."""
     standing, known = findings.standings(result), {p.name: p for p in result.model.parameters}
     redundant = result.left.redundant if result.left else ()
     groups: dict[str, list[Estimate]] = {}

@@ -70,10 +70,8 @@ def _doubt(f: Finding) -> str:
 
 DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "not_converged": "the fit did not converge ({reason})",
-    "no_better_than_nominal": (
-        "the held-out error ({heldout_rms_um} rms) is not below that of the nominal arm "
-        "({nominal_rms_um})"
-    ),
+    "no_better_than_nominal": "the held-out error ({heldout_rms_um} rms) is not below that of the "
+    "nominal arm ({nominal_rms_um})",
     "not_held_out": lambda f: (
         "there is no held-out error: some pose alone determines a parameter, and nothing checks it"
         + (
@@ -83,14 +81,10 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         )
     ),
     "residual_above_stated_noise": "the residual is {ratio} times the stated noise",
-    "residual_below_stated_noise": (
-        "the stated noise is too large (the residual is {ratio} times it), so a missing effect "
-        "would not show"
-    ),
-    "common_noise_too_large": (
-        "what is stated as common to a configuration is too large (configurations scatter {ratio} "
-        "times as much), so a missing effect would not show"
-    ),
+    "residual_below_stated_noise": "the stated noise is too large (the residual is {ratio} times "
+    "it), so a missing effect would not show",
+    "common_noise_too_large": "what is stated as common to a configuration is too large "
+    "(configurations scatter {ratio} times as much), so a missing effect would not show",
     "residuals_heavy_tailed": lambda f: (
         "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
@@ -122,10 +116,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters "
         f"(needed: {f.numbers['needed']})"
     ),
-    "noise_unknown": (
-        "the noise level is unknown (neither stated nor repeated), so the residual may hide a "
-        "missing effect"
-    ),
+    "noise_unknown": "the noise level is unknown (neither stated nor repeated), so the residual "
+    "may hide a missing effect",
     "new_poses_not_shown": lambda f: (
         f"{_length(f, 'open_um')} of the error at new poses comes from parameters that the "
         f"measured poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
@@ -139,10 +131,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "many_left_out": "{left_out} readings are excluded as outliers, and {fitted} are fitted",
     "drift": "base or tracker drift by {sigma_um} during the measurement session",
     "test_data_worse": "the test error ({test_rms_um} rms) is larger than chance explains",
-    "test_data_far": (
-        "{far} of {configurations} test poses are more uncertain than every measured pose "
-        "({predicted_std_um} rms over all test poses, at most {fitted_std_um} at measured ones)"
-    ),
+    "test_data_far": "{far} of {configurations} test poses are more uncertain than every measured "
+    "pose ({predicted_std_um} rms over all test poses, at most {fitted_std_um} at measured ones)",
 }
 
 
@@ -211,10 +201,8 @@ METHODS = {
     "ols": "ordinary least squares, all readings weighted alike",
     "wls": "weighted least squares",
     "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
-    "eq14-residual": (
-        "weighted least squares as published, weights of eq. (14) from each residual, iterated; "
-        "it acts like a robust fit, and its stated intervals are far too narrow"
-    ),
+    "eq14-residual": "weighted least squares as published, weights of eq. (14) from each residual, "
+    "iterated; it acts like a robust fit, and its stated intervals are far too narrow",
     "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
     "l1": "least sum of residual lengths (L1), robust like the median",
 }
@@ -315,10 +303,8 @@ COMPARED = (  # the first is against the noise that is stated
 )
 SHAPES = {
     "residuals_skew": "errors are skewed, as with a missing effect.",
-    "residuals_heavy_tailed": (
-        "large errors are more frequent. A robust method (huber, l1) shows "
-        "whether the estimates depend on them."
-    ),
+    "residuals_heavy_tailed": "large errors are more frequent. A robust method (huber, l1) shows "
+    "whether the estimates depend on them.",
     "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",
 }
 
@@ -344,23 +330,17 @@ def does_noise_explain_it(result: Calibration) -> str:
             of = "reading" if observed.kind == "distance" else "coordinate"
             return f"{text}; the residual amounts to {say.length(result.noise.sigma)} per {of}."
         return f"{text}{'; the noise level was estimated from the readings' * estimated}."
-    size = (
-        f"{say.significant(f.number('ratio'))} times the stated noise; chance alone gives "
-        f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
-    )
+    size = f"{say.significant(f.number('ratio'))} times the stated noise; chance alone gives "
+    size += f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
     if f.kind == "residual_agrees_with_stated_noise":
         return f"The residual agrees with the stated noise ({size})."
     single = result.finding("stated_noise_too_small")
     if f.kind == "residual_agrees_with_readings" and single is not None:
-        text = (
-            f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
-            f"scatter by {say.significant(single.number('ratio'))} times the stated noise."
-        )
+        text = f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
+        text += f"scatter by {say.significant(single.number('ratio'))} times the stated noise."
     elif f.kind == "residual_above_stated_noise":
-        text = (
-            f"The residual is larger than the stated noise explains ({size}): an effect is "
-            "missing, or the noise is larger than stated."
-        )
+        text = f"The residual is larger than the stated noise explains ({size}): an effect is "
+        text += "missing, or the noise is larger than stated."
     else:
         text = f"The residual is smaller than the stated noise ({size}), which is too large."
     return text + " Weights and intervals use the estimated noise." * estimated
@@ -371,7 +351,8 @@ def noise_model_line(result: Calibration) -> str | None:
     sizes, reason = _sizes(noise), noise.reason
     if not sizes and not reason:
         return None
-    text = say.capital(printable(noise.description))
+    text = printable(noise.description)
+    text = text[:1].upper() + text[1:]
     text += f": {'; '.join(sizes)}" if sizes else ""
     candidates = candidate_table(noise).rows
     if (n := len(candidates)) > 1:
@@ -416,10 +397,8 @@ def repeats_line(result: Calibration) -> str | None:
     f = result.finding("lack_of_fit", "repeats_agree")
     if f is None:
         return None
-    numbers = (
-        f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
-        f"{f.numbers['dof_pure']} degrees of freedom, {say.size_of(f.number('p'))}"
-    )
+    numbers = f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
+    numbers += f"{f.numbers['dof_pure']} degrees of freedom, {say.size_of(f.number('p'))}"
     by = str(f.numbers["counted_by"])
     if f.kind == "repeats_agree":
         text = f"Repeats agree with the scatter between configurations ({numbers})"
@@ -442,9 +421,8 @@ def repeats_line(result: Calibration) -> str | None:
 
 def shape_line(summary: ResidualSummary) -> str:
     f = shape_of(summary)
-    numbers = (
-        f"skewness {f.number('skewness'):+.2f}, excess kurtosis {f.number('excess_kurtosis'):+.2f}"
-    )
+    numbers = f"skewness {f.number('skewness'):+.2f}, excess "
+    numbers += f"kurtosis {f.number('excess_kurtosis'):+.2f}"
     if f.kind == "residuals_too_few":
         text = f"Too few values to judge whether residuals are normal ({numbers})."
     else:
@@ -453,10 +431,8 @@ def shape_line(summary: ResidualSummary) -> str:
         if f.kind != "residuals_normal":
             text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
     if (scatter := summary.whole.held_out_mean_square) is not None:
-        text += (
-            f" In held-out configurations the scatter is {say.significant(scatter**0.5)} times "
-            "that of the noise model."
-        )
+        text += f" In held-out configurations the scatter is {say.significant(scatter**0.5)} times "
+        text += "that of the noise model."
     groups = [f"{row[0]} {row[2]} times" for row in deviating_table(summary).rows[:MOST_GROUPS]]
     if not groups:
         return f"{text} No group of readings deviates from the noise model."
@@ -481,8 +457,8 @@ def in_time_line(result: Calibration) -> str | None:
         return None
     numbers = (
         f"correlation {found.correlations[0]:+.2f} over {found.visits} visits in the order of "
-        f"{'their times' if found.by == 'times' else 'the rows'}, {say.size_of(found.p)}"
     )
+    numbers += f"{'their times' if found.by == 'times' else 'the rows'}, {say.size_of(found.p)}"
     told = result.finding("autocorrelated")
     which = "Residuals of successive visits are"
     if told is None:

@@ -379,7 +379,6 @@ def sources(result: Any) -> list[Path]:
 
 
 def digests_of(inputs: Inputs) -> dict[str, str]:
-    """File name → SHA-256; a map is taken as it is."""
     if inputs is None or isinstance(inputs, Mapping):
         return dict(inputs or {})
     found = {}

@@ -82,31 +82,19 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         verdict = "The arm has changed, but no single parameter is significant."
     yield say.ShownVerdict(tone, verdict)
     loads = say.loads_text(c.forces, "{}", "{} loads in turn")
-    moved = (
-        f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
-        f"poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone gives "
-        f"{noise} rms."
-    )
-    chance = (
-        f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by Holm's rule: "
-        f"if nothing has changed, the probability of any finding is {c.level:g} at most."
-    )
-    compared = [
-        "The arm itself. Base and markers are set up anew each time: a change that a motion of the "
-        "base or the markers also explains is not seen."
-    ]
-    if c.first_order:
-        compared.append(
-            "The sessions determined different parameters; what both show is compared, to first "
-            "order."
-        )
-    if mostly:
-        compared.append(
-            "A change of what is determined mostly by a prior is hardly seen, and its part of the "
-            f"noise is that of the prior: {some(mostly, 8)}."
-        )
     yield say.Lines([
-        ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
+        ("Tool", f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} "
+         f"random poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone "
+         f"gives {noise} rms."),
+        ("Chance", f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by "
+         "Holm's rule: if nothing has changed, the probability of any finding is "
+         f"{c.level:g} at most."),
+        ("Compared", "The arm itself. Base and markers are set up anew each time: a change that a "
+         "motion of the base or the markers also explains is not seen."),
+        ("Compared", "The sessions determined different parameters; what both show is compared, to "
+         "first order." if c.first_order else None),
+        ("Compared", "A change of what is determined mostly by a prior is hardly seen, and its "
+         f"part of the noise is that of the prior: {some(mostly, 8)}." if mostly else None),
         *(("Not compared", printable(f"{some(names, 8)} ({why})."))
           for why, names in c.not_compared.items()),
         *(("Next", step) for step in steps),
@@ -411,14 +399,13 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
     certified = Certified(result, budget)
     yield judgement(result)
-    told = [
-        (name.replace("_", " "), printable(value))
-        for name, value in vars(entries).items() if isinstance(value, str)
-    ]  # fmt: skip
-    if entries.temperature is not None:
-        told.append(("temperature", f"{entries.temperature:g} °C"))
-    if (own := entries.instrument_uncertainty) is not None:
-        told.append(("instrument's expanded uncertainty, k = 2", say.length(own)))
+    degrees, own = entries.temperature, entries.instrument_uncertainty
+    told = say.Lines([
+        *((name.replace("_", " "), printable(value))
+          for name, value in vars(entries).items() if isinstance(value, str)),
+        ("temperature", None if degrees is None else f"{degrees:g} °C"),
+        ("instrument's expanded uncertainty, k = 2", None if own is None else say.length(own)),
+    ]).items  # fmt: skip
     yield say.ShownTable(("entry", ""), told, (0, 1), title="Entries")
     if told and entries.missing:
         yield say.Sentence(
@@ -437,10 +424,10 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         each = {name: dict.fromkeys(np.atleast_1d(v).tolist()) for name, v in vars(stated).items()}
         noise = ", ".join(
             f"{name.replace('_', ' ')} {', '.join(map(say.length, sizes))}"
-            + (" per m" if name.endswith("per_m") else "")
+            f"{' per m' * name.endswith('per_m')}"
             for name, sizes in each.items()
         )
-    facts = [
+    facts = say.Lines([
         ("Robot", printable(result.model.chain.name)),
         ("Joints", names_told(result.model.chain)),
         ("Instrument, standard deviations", noise),
@@ -450,9 +437,8 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         ("Method", say.sentence(method_and_weights(result))),
         ("Expected error", fitted.at_new_poses(result.predicted)),
         ("Prediction", fitted.prediction_line(result)),
-    ]
-    title = "What was calibrated, and by what"
-    yield say.ShownTable(("what", ""), say.Lines(facts).items, (0, 1), title=title)
+    ]).items  # fmt: skip
+    yield say.ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
 
 
 class Certified:
@@ -538,10 +524,8 @@ def _uncertainty(certified: Certified) -> Iterator[say.Block]:
     rows.append(("expanded, U with k = 2", "", say.length(K * math.sqrt(square)), ""))
     heads = ("source", "type", "standard uncertainty", "share of the variance")
     of_what = "coordinate of a position" if certified.coordinates == 3 else "distance"
-    note = (
-        f"Of a {of_what} that the calibrated model predicts, against one reading (GUM, JCGM 100). "
-        "U covers about 95 %."
-    )
+    note = f"Of a {of_what} that the calibrated model predicts, against one reading (GUM, JCGM "
+    note += "100). U covers about 95 %."
     if all(name != INSTRUMENT for name, *_ in sources):
         note += " Without the instrument's own calibration, which [certificate] does not state."
     yield say.ShownTable(heads, rows, (0, 1), title="Uncertainty", note=note)
@@ -560,9 +544,8 @@ def _poses(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Bloc
             soft=True,
         )
     else:
-        yield say.Sentence(
-            "Pose accuracy is not known: no configuration can be left out of the fit."
-        )
+        none = "no configuration can be left out of the fit"
+        yield say.Sentence(f"Pose accuracy is not known: {none}.")
     if len(rp := pose_repeatability(result)):
         yield say.Sentence(
             f"Pose repeatability RP (ISO 9283): {say.length(float(rp.mean()))} in the mean of "
