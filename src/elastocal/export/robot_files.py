@@ -590,9 +590,6 @@ class _MjcfText(XmlFile):
             if tag.name == name and above in ("", tag.above.name if tag.above else "")
         ]  # fmt: skip
 
-    def place(self, tag: Tag, T: Array) -> None:
-        self.set(tag, placed_body(None, T), ORIENTATIONS[1:])
-
     def move(self, body: int, error: Array) -> None:
         """T ← T · error for the body's own attributes, whatever frames stand around it."""
         tag, model = self.bodies[body], self.model
@@ -604,7 +601,8 @@ class _MjcfText(XmlFile):
             world = element("worldbody", {}, element("body", kept))
             alone = element("mujoco", {}, element("compiler", how), world)
             model, body = import_mujoco().MjModel.from_xml_string(alone), 1
-        self.place(tag, transform(model.body_pos[body], model.body_quat[body]) @ error)
+        T = transform(model.body_pos[body], model.body_quat[body]) @ error
+        self.set(tag, placed_body(None, T), ORIENTATIONS[1:])
 
     def add_springs(self, i: int, j: int) -> int:
         """Between link i and joint i, before the joint; returns how many."""
@@ -691,7 +689,7 @@ class _MjcfText(XmlFile):
         placed |= {name: T @ P for name, P in tool_frames(pieces).items() if frames}
         for name, place in placed.items():
             if name in sites:
-                self.place(sites[name], place)
+                self.set(sites[name], placed_body(None, place), ORIENTATIONS[1:])
             else:
                 site = placed_body(name, place) | {"size": "0.005", "group": "4"}
                 self.insert_in(self.bodies[body], element("site", site))

@@ -236,7 +236,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
     bare = re.compile(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""")
     whole = "\n".join(found[0] for line in lines if (found := bare.match(line)))
     ends = [match.start() for match in re.finditer("\n", whole)]
-    rows: list[Line] = []
+    rows: list[tuple[int, dict[str, str]]] = []
     ignored: list[tuple[int, str]] = []
     for offset, name, values in read(whole):
         line = bisect_left(ends, offset) + 1
@@ -258,7 +258,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
         for load in filter(None, map(_MEASURED.match, lines[line : line + 3])):
             if own and load[1] == own[1]:  # at once, or after a stop to change the load
                 kept |= dict(zip(hung, load.groups("0")[1:], strict=True))
-        rows.append((line, [name, *(kept.get(axis, "") for axis in (*axes, *hung))]))
+        rows.append((line, {"name": name} | kept))
     passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
     if not rows:
         raise InputError(
@@ -266,10 +266,9 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
             "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
-    header = ("name", *axes, *hung)
-    used = [i for i in range(len(header)) if not i or any(cells[i] for _, cells in rows)]
-    rows = [(line, [cells[i] for i in used]) for line, cells in rows]
-    return Rows(tuple(header[i] for i in used), rows, ignored, kind.upper())
+    header = tuple(h for h in ("name", *axes, *hung) if any(h in own for _, own in rows))
+    cells = [(line, [own.get(h, "") for h in header]) for line, own in rows]
+    return Rows(header, cells, ignored, kind.upper())
 
 
 # Offset into the text, name, and the values by axis or why there are none.
@@ -383,19 +382,6 @@ class Records:
             line=self.line[rows],
             numbers={stem: values[rows] for stem, values in self.numbers.items()},
             texts={stem: [own[i] for i in rows] for stem, own in self.texts.items()},
-        )
-
-    @classmethod
-    def stacked(cls, parts: Sequence[Records]) -> Records:
-        stems = dict.fromkeys(stem for part in parts for stem in part.texts)
-        return replace(
-            parts[0],
-            file=[file for part in parts for file in part.file],
-            line=np.concatenate([part.line for part in parts]),
-            numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
-            texts={
-                s: [text for p in parts for text in p.texts.get(s, [""] * len(p))] for s in stems
-            },
         )
 
 
@@ -705,23 +691,23 @@ def with_loads_of_names(
 ) -> tuple[dict[str, list[Records]], list[str]]:
     """With the loads that their files are named for, hanging straight down, where nothing else
     states any, and what to tell."""
-    made, every = dict(by_role), [r for role in by_role.values() for r in role]
+    every = [r for role in by_role.values() for r in role]
     named = {r.source: load_in(Path(r.source).stem) for r in every}
     # A log's forces are what was planned: names of files win.
     forces = [*by_role["points"], *([] if any(named.values()) else by_role["joints"])]
     if loads or any(r.load or "load" in r.texts for r in every) or any(r.forces for r in forces):
-        return made, []
+        return dict(by_role), []
     if not any(named.values()):
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
         told += [f"column {name} of {r.source}" for r in every
                  for name in r.understood["unused"] if _WORD.search(name)]  # fmt: skip
-        return made, [
+        return dict(by_role), [
             f"{listed(told)}: named for a load that is not taken, and the rows are written "
             "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
             "[source.columns]"
         ] if told else []  # fmt: skip
-    for role, files in by_role.items():
-        made[role] = [replace(r, load=(named[r.source] or UNLOADED[1:])[0]) for r in files]
+    made = {role: [replace(r, load=(named[r.source] or UNLOADED[1:])[0]) for r in files]
+            for role, files in by_role.items()}  # fmt: skip
     if not any(named[r.source] for r in by_role["points"]):
         # The points are those of the joint logs.
         only = {r.load for r in made["joints"]}
