@@ -565,9 +565,7 @@ def _fitted(
         regression = model.regressor(_commanded(rows, correction), x)
         B, r = regression.B[:, fit], target[settled].ravel() - regression.prediction
         if not sizes.size:
-            whole = np.zeros((len(r), len(x)))
-            whole[:, fit] = B
-            sizes = np.concatenate([model.sizes(whole)[fit], np.full(len(basis), SLOPPY)])
+            sizes = np.append(model.sizes(regression.B)[fit], np.full(len(basis), SLOPPY))
         if basis:
             turned = regression.B[:, turns][:, [j for j, *_ in basis]]
             B = np.hstack([B, turned * np.repeat(np.transpose(bent), 3, axis=0)])

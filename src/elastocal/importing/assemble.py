@@ -695,7 +695,8 @@ def _by_role(
         if role in ("joints", "both") and joint_stems(found.numbers):
             found = with_joints(where, found, table.joints, names)
         by_role["joints" if role == "joints" else "points"].append(found)
-        understood.append(found.understood | {"role": role})
+        read = {"role": role, "rows": len({*found.line}), "ignored": sorted(found.ignored)}
+        understood.append(found.understood | read)
     if not by_role["points"]:
         raise InputError(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "

@@ -317,8 +317,8 @@ UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are s
 class Records:
     """n rows of exported files; `file` (n,) and `line` (n,) say where each stands.  `numbers` stem
     → (n,) in `units[stem]`, the units of the table to be written; `texts` (name, configuration,
-    marker, repeat, load) → n texts; `load` of all rows, where one is stated; `understood`: the
-    command's JSON, `ignored` in it (line, reason) of all passed over; `doubts`: what to warn of."""
+    marker, repeat, load) → n texts; `load` of all rows, where one is stated; `understood`: what was
+    made of the file, for people; `ignored`: line and reason; `doubts`: what to warn of."""
 
     file: list[str]
     line: IntArray
@@ -326,6 +326,7 @@ class Records:
     units: dict[str, str]
     texts: dict[str, list[str]]
     understood: dict[str, Any]
+    ignored: set[tuple[int, str]]
     load: str | None = None
     doubts: Sequence[str] = ()
 
@@ -422,14 +423,14 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     texts = {}
     for c in (c for c in next(iter(columns.values())) if not c.quantities):
         glue = " " if c.stem == "time_text" else "::"
-        texts[c.stem] = [glue.join(row[i].strip() for i in c.index) for _, row, _ in kept]
+        texts[c.stem] = [glue.join(row[i].strip() for i in c.index) for _, row, *_ in kept]
         # A load that is a bare size gets the unit in its header.
         if c.stem == "load" and (unit := re.search(UNIT_OF_LOAD, c.header)):
             bare = re.compile(r"[\d.,]+")
             texts["load"] = [f"{t} {unit[1]}" if bare.fullmatch(t) else t for t in texts["load"]]
     if "" not in columns:
-        texts["marker"] = [marker for _, _, marker in kept]
-    line = np.array([number for number, _, _ in kept], dtype=np.int64)
+        texts["marker"] = [marker for _, _, marker, _ in kept]
+    line = np.array([number for number, *_ in kept], dtype=np.int64)
     written = texts.pop("time_text", None)
     if written is not None and "time" not in numbers:
         form = source.time_format or ()
@@ -446,23 +447,26 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         ],
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
                         if i - 1 not in used),
-        "rows": len({*line}), "ignored": tuple(sorted({*table.ignored, *ignored})),
     }  # fmt: skip
     told = f"{name}: column %r states no unit and is not read; name it with one, as %s [%s]"
     doubts = [told % (n, c.stem, next(iter(FACTORS[c.quantities[0]]))) for n, c in no_unit.items()]
-    return Records([name] * len(line), line, numbers, of, texts, understood, source.load, doubts)
+    return Records(
+        [name] * len(line), line, numbers, of, texts, understood, {*table.ignored, *ignored},
+        source.load, doubts,
+    )  # fmt: skip
+
+
+KeptRow = tuple[int, list[str], str, list[float]]  # line, cells, marker, and its numbers
 
 
 def _rows(
     name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]],
     cells: mapping_file.NumberCells, coverage: float,
-) -> tuple[list[tuple[int, list[str], str]], dict[str, Array], dict[str, str],
-           list[tuple[int, str]]]:  # fmt: skip
-    """Complete rows (line, cells, marker), their numbers by column and the units of the measurement
-    table that these are in; what is passed over and why."""
+) -> tuple[list[KeptRow], dict[str, Array], dict[str, str], list[tuple[int, str]]]:  # fmt: skip
+    """Complete rows, their numbers by column and the units of the measurement table that these are
+    in; what is passed over and why."""
     widest = max((c for own in columns.values() for c in own), key=lambda c: max(c.index))
-    kept, ignored = list[tuple[int, list[str], str]](), list[tuple[int, str]]()
-    read: dict[str, list[list[float]]] = {marker: [] for marker in columns}
+    kept, ignored = list[KeptRow](), list[tuple[int, str]]()
     for number, row in table.rows:
         at = max(widest.index) + 1
         what = f"{widest.key} is column {at} ({widest.header})" if at > len(row) else ""
@@ -482,8 +486,7 @@ def _rows(
                     break
                 found.append(value)
             else:
-                kept.append((number, row, marker))
-                read[marker].append(found)
+                kept.append((number, row, marker, found))
     if not kept:
         number, reason = ignored[0]
         raise InputError(
@@ -496,7 +499,7 @@ def _rows(
         for k, c in enumerate(c for c in own if c.quantities):
             sigma = c.stem.startswith("sigma_")
             of[c.stem] = "um" if sigma else next(iter(FACTORS[quantities(c.unit)[0]]))
-            values = np.array([values[k] for values in read[marker]])
+            values = np.array([kept[i][3][k] for i in rows])
             values = convert(values, c.unit, of[c.stem]) / (coverage if sigma else 1.0)
             # Seconds and nanoseconds of a time add up.
             numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += values
@@ -626,12 +629,10 @@ def _with_names_read(where: str, records: Records, names: mapping_file.NamesTabl
                     f"{NAMED} that finds it in every name"
                 )
         present[stem] = [text or unsaid.get(stem, "") for text in texts]
-    reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
+    reasons = {(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad}
     good = np.setdiff1d(np.arange(len(records)), bad)
-    kept = replace(records, texts=present | records.texts).take(good)
-    ignored = tuple(sorted([*records.understood["ignored"], *reasons]))
-    rows = len({*kept.line})
-    return replace(kept, understood=kept.understood | {"rows": rows, "ignored": ignored})
+    made = replace(records, texts=present | records.texts, ignored=records.ignored | reasons)
+    return made.take(good)
 
 
 UNLOADED = ("none", "unloaded", "0")
