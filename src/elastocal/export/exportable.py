@@ -140,8 +140,8 @@ class ExportNumbers:
     `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of the
     joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point` (3,) in
     the flange frame; `load_scale`: what acts per newton declared; `springs`: those that yield, with
-    their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no weights act.
-    """
+    their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no weights act;
+    `compensator`: values of `gravity_compensator` by name."""
 
     chain: Chain
     links: tuple[Array, ...]
@@ -152,6 +152,7 @@ class ExportNumbers:
     load_scale: float
     springs: dict[Spring, float]
     masses: tuple[LinkMass, ...]
+    compensator: dict[str, float]
 
     def offset_motion(self, i: int) -> Array:
         """Motion (4, 4) of joint i (0-based) by its offset: what stands at encoder zero."""
@@ -209,6 +210,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     offsets, T_tracker_base, compliance, *placed = found
     n, values = model.chain.n_joints, part.values
     scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
+
     return ExportNumbers(
         chain=model.chain,
         links=tuple(placed[:n]),
@@ -221,6 +223,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
             s: k for s, k in zip(arm.springs, compliance[:, 0].tolist(), strict=True) if k > 0
         },
         masses=_masses(model.chain, values, model.cell.model.link_gravity),
+        compensator={name: v for name, v in values.items() if ".compensator_" in name},
     )
 
 

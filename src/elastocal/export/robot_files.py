@@ -275,14 +275,13 @@ IDENTITY, NOTHING = np.eye(4), LinkMass(0.0, np.zeros(3))
 
 
 def calibrated_mjcf(
-    pieces: ExportNumbers, note: str, inertias: Sequence[Array],
-    compensator: dict[str, float] | None, base_frame: bool,
-) -> str:  # fmt: skip
+    pieces: ExportNumbers, note: str, inertias: Sequence[Array], base_frame: bool
+) -> str:
     """Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
     actuators load_x, load_y, load_z (control: N at the load point, axes of the tracker).  Sites:
     flange, load_point, marker_NAME.  The world is the robot's base, or with `base_frame` the
     tracker's frame.  `inertias`: (3, 3) kg m² per link about its centre of mass in its joint's
-    axes; `compensator`: values of `gravity_compensator` by key, with `joint` its 0-based index."""
+    axes."""
     chain = pieces.chain
     root = ET.Element("mujoco", model=chain.name)
     root.append(ET.Comment(f" {note.replace('--', '- -')} "))
@@ -307,7 +306,10 @@ def calibrated_mjcf(
         if before:  # on a body of their own: MuJoCo takes six joints at most in one
             body, T = _body(body, f"link{i}_end", T), np.eye(4)
             _passive(body, before)
-        compensated = compensator if compensator and compensator["joint"] == i else None
+        named = f"joint{i + 1}.compensator_"
+        compensated = {
+            n.removeprefix(named): v for n, v in pieces.compensator.items() if named in n
+        }
         if compensated:
             _compensate(root, body, T, joint.axis, compensated)
         mass = pieces.masses[i] if pieces.masses else NOTHING
@@ -322,7 +324,7 @@ def calibrated_mjcf(
         if compensated:
             # The offset turns the frame about the axis before the joint moves, and the model's
             # angle counts it; so the arm's end stands at angle zero of the joint's own frame.
-            arm = compensated["compensator_arm"] * transverse_axes(joint.axis)[0]
+            arm = compensated["arm"] * transverse_axes(joint.axis)[0]
             ET.SubElement(body, "site", name="compensator_arm", pos=numbers(arm))
         before = pieces.springs_at(f"link{i + 1}")
         end = pieces.links[i][:3, 3]
@@ -406,13 +408,12 @@ def _compensate(
 ) -> None:
     """Its spring hangs on the link before the joint: opposite (a_x, a_y)."""
     x, y = transverse_axes(axis)
-    point = -values["compensator_anchor_x"] * x - values["compensator_anchor_y"] * y
+    point = -values["anchor_x"] * x - values["anchor_y"] * y
     place = T[:3, :3] @ point + T[:3, 3]
     ET.SubElement(body, "site", name="compensator_anchor", pos=numbers(place))
     spring = ET.SubElement(
         ET.SubElement(root, "tendon"), "spatial", name="compensator",
-        stiffness=repr(values["compensator_stiffness"]),
-        springlength=repr(values["compensator_free_length"]),
+        stiffness=repr(values["stiffness"]), springlength=repr(values["free_length"]),
     )  # fmt: skip
     for site in ("compensator_anchor", "compensator_arm"):
         ET.SubElement(spring, "site", site=site)
