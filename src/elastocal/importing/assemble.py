@@ -666,12 +666,8 @@ def import_files(
                 "correct unit, sign, offset_deg or order in [joints], or the limits of the cell"
             )
         fit = nominal_fit(chain, cell, measured, spherical)
-    warnings += [
-        *told,
-        *(() if joined is None else joined.warnings),
-        *doubts,
-        *plausibility(columns, measured, cell is not None and observe == "deflection"),
-    ]
+    judged = plausibility(columns, measured, cell is not None and observe == "deflection")
+    warnings += [*told, *(joined.warnings if joined else ()), *doubts, *judged]
     warnings += [fit.warning] if fit is not None and fit.warning else []
     return Imported(
         tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
