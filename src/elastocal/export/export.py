@@ -370,10 +370,7 @@ class _Writing:
                     f"{robot.mjcf.name} itself cannot take the corrections: {reason}; this file is "
                     "a new one with the arm alone"
                 )
-        inertias: tuple[Array, ...] = ()
-        if pieces.masses and robot.urdf is not None:
-            inertias = exportable.link_inertias(robot.urdf, pieces.chain)
-        text = robot_files.calibrated_mjcf(pieces, self.note, inertias, self.wish.base_frame)
+        text = robot_files.calibrated_mjcf(robot, pieces, self.wish.base_frame, self.note)
         if not pieces.masses:
             warnings.append(
                 "the links weigh nothing in this file, as in the model it was identified with: "

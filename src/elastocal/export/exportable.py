@@ -31,7 +31,6 @@ from elastocal.model.effects.geometry import JointOffset, LinkGeometry
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
-from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
 from elastocal.units import Array, microns
 
@@ -238,23 +237,6 @@ def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple
         moment = nominal * body.com + [values.get(f"link{i}.moment_{k}", 0.0) for k in "xyz"]
         bodies.append(LinkMass(mass, moment / mass if mass > 0 else body.com))
     return tuple(bodies)
-
-
-def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
-    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes,
-    joints beside the chain at zero; empty where pinocchio reads no inertia in the file."""
-    import pinocchio as pin
-
-    file, moving = urdf_file(path), {joint.name for joint in chain.joints}
-    for joint in file.root.all("joint"):
-        if joint.get("name").strip() not in moving:
-            file.set(joint, {"type": "fixed"})
-    try:
-        model = pin.buildModelFromXML(file.result().removeprefix("\ufeff"))
-    except (ValueError, RuntimeError):
-        return ()
-    tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
-    return tuple(tensors) if len(tensors) == chain.n_joints else ()
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
 from elastocal.messages import ElastocalError, InputError, listed, option, require
 from elastocal.model import mjcf
-from elastocal.model.chain import Joint, LinkMass
+from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.mjcf import AXES, SPRING, SPRING_OF_NEW, MjcfArm, import_mujoco, transform
@@ -274,15 +274,31 @@ SHORTEST = 1e-3  # m; a shorter link is not drawn
 IDENTITY, NOTHING = np.eye(4), LinkMass(0.0, np.zeros(3))
 
 
-def calibrated_mjcf(
-    pieces: ExportNumbers, note: str, inertias: Sequence[Array], base_frame: bool
-) -> str:
+def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
+    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes,
+    joints beside the chain at zero; empty where pinocchio reads no inertia in the file."""
+    import pinocchio as pin
+
+    file, moving = urdf_file(path), {joint.name for joint in chain.joints}
+    for joint in file.root.all("joint"):
+        if joint.get("name").strip() not in moving:
+            file.set(joint, {"type": "fixed"})
+    try:
+        model = pin.buildModelFromXML(file.result().removeprefix("\ufeff"))
+    except (ValueError, RuntimeError):
+        return ()
+    tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
+    return tuple(tensors) if len(tensors) == chain.n_joints else ()
+
+
+def calibrated_mjcf(robot: Robot, pieces: ExportNumbers, base_frame: bool, note: str) -> str:
     """Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
     actuators load_x, load_y, load_z (control: N at the load point, axes of the tracker).  Sites:
     flange, load_point, marker_NAME.  The world is the robot's base, or with `base_frame` the
-    tracker's frame.  `inertias`: (3, 3) kg m² per link about its centre of mass in its joint's
-    axes."""
-    chain = pieces.chain
+    tracker's frame."""
+    chain, inertias = pieces.chain, tuple[Array, ...]()
+    if pieces.masses and robot.urdf is not None:
+        inertias = link_inertias(robot.urdf, chain)
     root = ET.Element("mujoco", model=chain.name)
     root.append(ET.Comment(f" {note.replace('--', '- -')} "))
     ET.SubElement(root, "compiler", angle="radian", balanceinertia="true", autolimits="false")
