@@ -91,20 +91,17 @@ def read_targets(
         require(not wrong, f"{path}: {told}")
     if force is not None:
         table = replace(table, force=np.tile(force, (len(table), 1)))
-    rotation = table.rotation
-    matrices = None if rotation is None else Rotation.from_rotvec(rotation).as_matrix()
-    return Targets(table, frame, table.position, matrices, q)
+    turn = None if table.rotation is None else Rotation.from_rotvec(table.rotation).as_matrix()
+    return Targets(table, frame, table.position, turn, q)
 
 
 def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
     """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
     what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
     values = calibrated.numbers(option("target"), text, (3, 6), what)
-    position = values[None, :3] / 1e3
-    rotation = None
-    if len(values) == 6:
-        rotation = Rotation.from_rotvec(np.radians(values[None, 3:])).as_matrix()
-    return targets_at(option("target"), position, rotation, frame, force)
+    vector = np.radians(values[None, 3:])
+    rotation = Rotation.from_rotvec(vector).as_matrix() if vector.size else None
+    return targets_at(option("target"), values[None, :3] / 1e3, rotation, frame, force)
 
 
 def targets_at(
@@ -334,10 +331,11 @@ def compensate(
     lost = np.flatnonzero(~_is_reached(after))
     if targets.q is None and len(lost):
         progress(f"other postures for {len(lost)} points")
-        nominal[lost] = _other_postures(
-            search, chain, position[lost], None if flange is None else flange[lost], place, lost,
-            nominal[lost], seed,
-        )  # fmt: skip
+        turned = None if flange is None else flange[lost]
+        others = inverse_kinematics(
+            chain, position[lost], limits, rotation=turned, point=place, seed=seed
+        )
+        nominal[lost] = _other_postures(search, others.q, lost, nominal[lost])
         q[lost], after[lost] = search.commands(nominal[lost], lost)
     search.rows = tool.rows(targets.moved(q, force))
     if not all(map(np.array_equal, rows, search.rows)):  # moves of the commands themselves
@@ -390,19 +388,14 @@ def _is_reached(missed: Array) -> BoolArray:
     return np.asarray((missed <= TOLERANCE).all(axis=1))
 
 
-def _other_postures(
-    search: Commanding, chain: Chain, position: Array, flange: Array | None, place: Array,
-    lost: IntArray, nominal: Array, seed: int,
-) -> Array:  # fmt: skip
-    """Nominal commands (lost, joints) in another posture where the calibrated arm reaches the
-    target from one: the nearest to the old command."""
-    limits = search.lower, search.upper
-    found = inverse_kinematics(chain, position, limits, rotation=flange, point=place, seed=seed)
-    n, count, joints = found.q.shape
-    missed = search.commands(found.q.reshape(n * count, joints), np.repeat(lost, count))[1]
+def _other_postures(search: Commanding, q: Array, lost: IntArray, nominal: Array) -> Array:
+    """Nominal commands (lost, joints) in one of the postures q (lost, K, joints) where the
+    calibrated arm reaches the target from one: the nearest to the old command."""
+    n, count, joints = q.shape
+    missed = search.commands(q.reshape(n * count, joints), np.repeat(lost, count))[1]
     good = _is_reached(missed).reshape(n, count)
-    far = np.linalg.norm(found.q - nominal[:, None], axis=2)
-    chosen = found.q[np.arange(n), np.where(good, far, np.inf).argmin(axis=1)]
+    far = np.linalg.norm(q - nominal[:, None], axis=2)
+    chosen = q[np.arange(n), np.where(good, far, np.inf).argmin(axis=1)]
     return np.where(good.any(axis=1, keepdims=True), chosen, nominal)
 
 
@@ -454,7 +447,7 @@ def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) ->
             "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
             "the posture wanted"
         )
-    change = np.abs(q - c.nominal)[:, np.array(kinds) == "revolute"].max(axis=1, initial=0.0)
+    change = np.abs(q - c.nominal)[:, c.chain.turning].max(axis=1, initial=0.0)
     large = c.reached & (change > LARGE_CORRECTION)
     most = np.degrees(change[large].max(initial=0.0))
     told = f"a joint is corrected by up to {most:.1f}°, as beside a singular posture; check that"

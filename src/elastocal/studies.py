@@ -109,7 +109,6 @@ class Study:
 
     folder: Path
     sources: Sources
-    module: ModuleType
     tasks: tuple[Row, ...]
 
 
@@ -130,8 +129,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     settled: dict[str, Any] = {"title": stated.title or whole.name, "options": chosen}
     settled |= {} if seed is None else {"seed": seed}
     sources = Sources(whole, _contents(whole, stated, path), stated.model_copy(update=settled))
-    module = load(sources)
-    return Study(folder, sources, module, tuple(_tasks(folder, module, sources)))
+    return Study(folder, sources, tuple(_tasks(folder, load(sources), sources)))
 
 
 def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
@@ -257,30 +255,27 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
         ) from error
 
 
-def line_of(
-    task: Row, rows: Sequence[Row] = (), seconds: float = 0.0, error: str | None = None,
-    trace: str | None = None,
-) -> Row:  # fmt: skip
+def line_of(task: Row, error: str | None = None, **found: Any) -> Row:
     """The line of results of a task; of one that failed with its `trace`."""
-    told = {"task_error": error, "trace": trace or error}
-    return task | {"rows": rows, "task_seconds": seconds, "elastocal": __version__} | told
+    line = {"rows": [], "task_seconds": 0.0, "elastocal": __version__, "task_error": error}
+    return task | line | {"trace": error} | found
 
 
 def execute(sources: Sources, task: Row) -> Row:
     """The line of results of a task, whose draws are those of child `task` of SeedSequence(seed),
     whoever computes it and however many there are."""
-    begun, rows, error, trace = time.perf_counter(), list[Row](), None, None
+    begun = time.perf_counter()
     draws = np.random.SeedSequence(sources.stated.seed, spawn_key=(task["task"],))
     try:
         if sources.version != __version__:
             told = f"this worker has elastocal {__version__}, the study was started with"
             raise RuntimeError(f"{told} {sources.version}; install the same there")
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
-        rows = _checked_rows(found, sources.stated.columns, task["values"])
-    except (Exception, SystemExit) as caught:
-        error = " ".join([f"{type(caught).__name__}:", *str(caught).split()])
-        trace = traceback.format_exc()
-    return line_of(task, rows, time.perf_counter() - begun, error, trace)
+        line = line_of(task, rows=_checked_rows(found, sources.stated.columns, task["values"]))
+    except (Exception, SystemExit) as error:
+        told = " ".join([f"{type(error).__name__}:", *str(error).split()])
+        line = line_of(task, told, trace=traceback.format_exc())
+    return line | {"task_seconds": time.perf_counter() - begun}
 
 
 def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row]:
@@ -485,13 +480,13 @@ def _lines(
                 if died[task["task"]] < TRIES:
                     waiting.appendleft(task)
                 else:
-                    yield line_of(task, error=DIED.format(TRIES))
+                    yield line_of(task, DIED.format(TRIES))
             except (CancelledError, OSError):
                 raise
             except Exception as error:  # execute() returns what a task raises
                 deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
                 told = f"the worker could not run it: {type(error).__name__}: {error}"
-                yield line_of(task, error=told if deaths is None else DIED.format(deaths + 1))
+                yield line_of(task, told if deaths is None else DIED.format(deaths + 1))
 
 
 def _security(
@@ -654,8 +649,7 @@ def _changes(now: Study, before: dict[str, Any]) -> list[str]:
 def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     """What summary(frame) of study.py says of the rows in the order of their tasks, also written to
     `page`; None without one."""
-    summary = getattr(study.module, "summary", None)
-    if summary is None:
+    if (summary := getattr(load(study.sources), "summary", None)) is None:
         return None
     frame = read_results(output)
     frame = frame[frame["task"] < len(study.tasks)]

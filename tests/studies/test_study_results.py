@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.study_folders import SCRIPT, TOML, here, numbers, on_processes, run_study, write_study
 
 from elastocal.messages import InputError
-from elastocal.studies import opened, read_results, read_study
+from elastocal.studies import load, opened, read_results, read_study
 from elastocal.studies import run_study as run_prepared
 
 PAGE = Path(__file__).parents[2] / "docs" / "studies.md"
@@ -143,4 +143,4 @@ def test_the_study_shown_runs(tmp_path):
     assert (ending.done, ending.failed) == (1, 0)
     frame = read_results(tmp_path / "r")
     assert frame["error"].abs().max() < 1.0  # µrad/(N·m)
-    assert read_study(folder).module.summary(frame).startswith("| readings per pose |")
+    assert load(read_study(folder).sources).summary(frame).startswith("| readings per pose |")

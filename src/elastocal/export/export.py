@@ -24,8 +24,8 @@ from elastocal.identification.least_squares import t_quantile
 from elastocal.measurements import Measurements
 from elastocal.messages import ElastocalError, listed, option, plain, require, rounded
 from elastocal.model import dh
-from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
-from elastocal.model.chain import Chain, Joint, joint_index
+from elastocal.model.calibrated import CalibratedArm, Conditions, random_table
+from elastocal.model.chain import Chain, Joint
 from elastocal.model.effects.base import given_force, transverse_axes
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm
@@ -370,12 +370,7 @@ class _Writing:
                     f"{robot.mjcf.name} itself cannot take the corrections: {reason}; this file is "
                     "a new one with the arm alone"
                 )
-        inertias: tuple[Array, ...] = ()
-        if pieces.masses and robot.urdf is not None:
-            inertias = exportable.link_inertias(robot.urdf, pieces.chain)
-        text = robot_files.calibrated_mjcf(
-            pieces, self.note, inertias, _compensator(self.kept.exported), self.wish.base_frame
-        )
+        text = robot_files.calibrated_mjcf(robot, pieces, self.wish.base_frame, self.note)
         if not pieces.masses:
             warnings.append(
                 "the links weigh nothing in this file, as in the model it was identified with: "
@@ -393,7 +388,7 @@ class _Writing:
         cell, pieces = self.calibrated.model.cell, self.pieces
         if self.wish.base_frame:
             raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
-        if _compensator(self.kept.exported) is not None:
+        if pieces.compensator:
             raise NotInPlace("it has no gravity compensator")
         if pieces.masses and not cell.model.link_gravity:
             how = "without those of the file (link_gravity = false)"
@@ -479,15 +474,6 @@ def _accepted(distance: float, largest: float) -> float:
         told = f"read back, is {messages.length(distance)} from the model and was not kept"
         raise ElastocalError(f"the written file, {told}; please report this robot description")
     return distance
-
-
-def _compensator(part: Valued) -> dict[str, float] | None:
-    """By key, with its 0-based joint."""
-    values = {name: v for name, v in part.values.items() if ".compensator_" in name}
-    if not values:
-        return None
-    joint = joint_index(next(iter(values)).partition(".")[0])
-    return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
 
 
 # A link between two joint axes as Denavit–Hartenberg parameters.

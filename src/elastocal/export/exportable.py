@@ -31,7 +31,6 @@ from elastocal.model.effects.geometry import JointOffset, LinkGeometry
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
-from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
 from elastocal.units import Array, microns
 
@@ -140,8 +139,8 @@ class ExportNumbers:
     `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of the
     joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point` (3,) in
     the flange frame; `load_scale`: what acts per newton declared; `springs`: those that yield, with
-    their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no weights act.
-    """
+    their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no weights act;
+    `compensator`: values of `gravity_compensator` by name."""
 
     chain: Chain
     links: tuple[Array, ...]
@@ -152,6 +151,7 @@ class ExportNumbers:
     load_scale: float
     springs: dict[Spring, float]
     masses: tuple[LinkMass, ...]
+    compensator: dict[str, float]
 
     def offset_motion(self, i: int) -> Array:
         """Motion (4, 4) of joint i (0-based) by its offset: what stands at encoder zero."""
@@ -209,6 +209,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     offsets, T_tracker_base, compliance, *placed = found
     n, values = model.chain.n_joints, part.values
     scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
+
     return ExportNumbers(
         chain=model.chain,
         links=tuple(placed[:n]),
@@ -221,6 +222,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
             s: k for s, k in zip(arm.springs, compliance[:, 0].tolist(), strict=True) if k > 0
         },
         masses=_masses(model.chain, values, model.cell.model.link_gravity),
+        compensator={name: v for name, v in values.items() if ".compensator_" in name},
     )
 
 
@@ -235,23 +237,6 @@ def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple
         moment = nominal * body.com + [values.get(f"link{i}.moment_{k}", 0.0) for k in "xyz"]
         bodies.append(LinkMass(mass, moment / mass if mass > 0 else body.com))
     return tuple(bodies)
-
-
-def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
-    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes,
-    joints beside the chain at zero; empty where pinocchio reads no inertia in the file."""
-    import pinocchio as pin
-
-    file, moving = urdf_file(path), {joint.name for joint in chain.joints}
-    for joint in file.root.all("joint"):
-        if joint.get("name").strip() not in moving:
-            file.set(joint, {"type": "fixed"})
-    try:
-        model = pin.buildModelFromXML(file.result().removeprefix("\ufeff"))
-    except (ValueError, RuntimeError):
-        return ()
-    tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
-    return tuple(tensors) if len(tensors) == chain.n_joints else ()
 
 
 @dataclass(frozen=True)
@@ -565,9 +550,7 @@ def _fitted(
         regression = model.regressor(_commanded(rows, correction), x)
         B, r = regression.B[:, fit], target[settled].ravel() - regression.prediction
         if not sizes.size:
-            whole = np.zeros((len(r), len(x)))
-            whole[:, fit] = B
-            sizes = np.concatenate([model.sizes(whole)[fit], np.full(len(basis), SLOPPY)])
+            sizes = np.append(model.sizes(regression.B)[fit], np.full(len(basis), SLOPPY))
         if basis:
             turned = regression.B[:, turns][:, [j for j, *_ in basis]]
             B = np.hstack([B, turned * np.repeat(np.transpose(bent), 3, axis=0)])

@@ -20,7 +20,7 @@ from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
 from elastocal.messages import ElastocalError, InputError, listed, option, require
 from elastocal.model import mjcf
-from elastocal.model.chain import Joint, LinkMass
+from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.mjcf import AXES, SPRING, SPRING_OF_NEW, MjcfArm, import_mujoco, transform
@@ -274,16 +274,31 @@ SHORTEST = 1e-3  # m; a shorter link is not drawn
 IDENTITY, NOTHING = np.eye(4), LinkMass(0.0, np.zeros(3))
 
 
-def calibrated_mjcf(
-    pieces: ExportNumbers, note: str, inertias: Sequence[Array],
-    compensator: dict[str, float] | None, base_frame: bool,
-) -> str:  # fmt: skip
+def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
+    """(3, 3) kg m² per joint about the centre of mass of all that it carries, in its frame's axes,
+    joints beside the chain at zero; empty where pinocchio reads no inertia in the file."""
+    import pinocchio as pin
+
+    file, moving = urdf_file(path), {joint.name for joint in chain.joints}
+    for joint in file.root.all("joint"):
+        if joint.get("name").strip() not in moving:
+            file.set(joint, {"type": "fixed"})
+    try:
+        model = pin.buildModelFromXML(file.result().removeprefix("\ufeff"))
+    except (ValueError, RuntimeError):
+        return ()
+    tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
+    return tuple(tensors) if len(tensors) == chain.n_joints else ()
+
+
+def calibrated_mjcf(robot: Robot, pieces: ExportNumbers, base_frame: bool, note: str) -> str:
     """Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
     actuators load_x, load_y, load_z (control: N at the load point, axes of the tracker).  Sites:
     flange, load_point, marker_NAME.  The world is the robot's base, or with `base_frame` the
-    tracker's frame.  `inertias`: (3, 3) kg m² per link about its centre of mass in its joint's
-    axes; `compensator`: values of `gravity_compensator` by key, with `joint` its 0-based index."""
-    chain = pieces.chain
+    tracker's frame."""
+    chain, inertias = pieces.chain, tuple[Array, ...]()
+    if pieces.masses and robot.urdf is not None:
+        inertias = link_inertias(robot.urdf, chain)
     root = ET.Element("mujoco", model=chain.name)
     root.append(ET.Comment(f" {note.replace('--', '- -')} "))
     ET.SubElement(root, "compiler", angle="radian", balanceinertia="true", autolimits="false")
@@ -307,7 +322,10 @@ def calibrated_mjcf(
         if before:  # on a body of their own: MuJoCo takes six joints at most in one
             body, T = _body(body, f"link{i}_end", T), np.eye(4)
             _passive(body, before)
-        compensated = compensator if compensator and compensator["joint"] == i else None
+        named = f"joint{i + 1}.compensator_"
+        compensated = {
+            n.removeprefix(named): v for n, v in pieces.compensator.items() if named in n
+        }
         if compensated:
             _compensate(root, body, T, joint.axis, compensated)
         mass = pieces.masses[i] if pieces.masses else NOTHING
@@ -322,7 +340,7 @@ def calibrated_mjcf(
         if compensated:
             # The offset turns the frame about the axis before the joint moves, and the model's
             # angle counts it; so the arm's end stands at angle zero of the joint's own frame.
-            arm = compensated["compensator_arm"] * transverse_axes(joint.axis)[0]
+            arm = compensated["arm"] * transverse_axes(joint.axis)[0]
             ET.SubElement(body, "site", name="compensator_arm", pos=numbers(arm))
         before = pieces.springs_at(f"link{i + 1}")
         end = pieces.links[i][:3, 3]
@@ -406,13 +424,12 @@ def _compensate(
 ) -> None:
     """Its spring hangs on the link before the joint: opposite (a_x, a_y)."""
     x, y = transverse_axes(axis)
-    point = -values["compensator_anchor_x"] * x - values["compensator_anchor_y"] * y
+    point = -values["anchor_x"] * x - values["anchor_y"] * y
     place = T[:3, :3] @ point + T[:3, 3]
     ET.SubElement(body, "site", name="compensator_anchor", pos=numbers(place))
     spring = ET.SubElement(
         ET.SubElement(root, "tendon"), "spatial", name="compensator",
-        stiffness=repr(values["compensator_stiffness"]),
-        springlength=repr(values["compensator_free_length"]),
+        stiffness=repr(values["stiffness"]), springlength=repr(values["free_length"]),
     )  # fmt: skip
     for site in ("compensator_anchor", "compensator_arm"):
         ET.SubElement(spring, "site", site=site)
@@ -590,9 +607,6 @@ class _MjcfText(XmlFile):
             if tag.name == name and above in ("", tag.above.name if tag.above else "")
         ]  # fmt: skip
 
-    def place(self, tag: Tag, T: Array) -> None:
-        self.set(tag, placed_body(None, T), ORIENTATIONS[1:])
-
     def move(self, body: int, error: Array) -> None:
         """T ← T · error for the body's own attributes, whatever frames stand around it."""
         tag, model = self.bodies[body], self.model
@@ -604,7 +618,8 @@ class _MjcfText(XmlFile):
             world = element("worldbody", {}, element("body", kept))
             alone = element("mujoco", {}, element("compiler", how), world)
             model, body = import_mujoco().MjModel.from_xml_string(alone), 1
-        self.place(tag, transform(model.body_pos[body], model.body_quat[body]) @ error)
+        T = transform(model.body_pos[body], model.body_quat[body]) @ error
+        self.set(tag, placed_body(None, T), ORIENTATIONS[1:])
 
     def add_springs(self, i: int, j: int) -> int:
         """Between link i and joint i, before the joint; returns how many."""
@@ -691,7 +706,7 @@ class _MjcfText(XmlFile):
         placed |= {name: T @ P for name, P in tool_frames(pieces).items() if frames}
         for name, place in placed.items():
             if name in sites:
-                self.place(sites[name], place)
+                self.set(sites[name], placed_body(None, place), ORIENTATIONS[1:])
             else:
                 site = placed_body(name, place) | {"size": "0.005", "group": "4"}
                 self.insert_in(self.bodies[body], element("site", site))

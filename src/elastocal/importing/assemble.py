@@ -128,7 +128,17 @@ def pooled(records: Sequence[Records]) -> Records:
                 f"{lacks.source}: has no {listed(sorted(one ^ two))}, but {has.source} has; files "
                 f"of one kind need the same {what}: correct [[source]], or import them one by one",
             )
-    return Records.stacked(records)
+    texts = {s: [text for r in records for text in r.texts.get(s, [""] * len(r))]
+             for s in dict.fromkeys(stem for r in records for stem in r.texts)}  # fmt: skip
+    return replace(
+        first,
+        file=[file for r in records for file in r.file],
+        line=np.concatenate([r.line for r in records]),
+        numbers={
+            stem: np.concatenate([r.numbers[stem] for r in records]) for stem in first.numbers
+        },
+        texts=texts,
+    )
 
 
 CHUNK = 1024
@@ -322,7 +332,7 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
                     f"; the visit that begins at {start} has {sizes[odd]} points, most have {most}"
                 )
             raise InputError(
-                f"{points.files[0]}: {len(chosen)} points{of} in {len(sizes)} visits, but "
+                f"{points.source}: {len(chosen)} points{of} in {len(sizes)} visits, but "
                 f"{listed(log.files, 3)} has {len(rows)} poses, and they are joined by "
                 f"order{hint}; {_ADVICE['order']}"
             )
@@ -337,7 +347,7 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     for pool, has in ((log, names), (points, own)):
         require(
             has,
-            f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
+            f"{pool.source}: no names of poses, by which [join] is to join; map name or "
             "configuration in [source.columns], and a pattern in [source.names]",
         )
     q, row = log.q, np.full(len(points), -1)
@@ -403,7 +413,7 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         first, last, standing = dwells(clock, q, still, shortest)
         require(
             len(first),
-            f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
+            f"{log.source}: the arm never stood still for {shortest:g} s; correct still_s and "
             "still_deg in [join], or join by time",
         )
     stop, apart = _nearest(at, clock[first], clock[last])
@@ -625,7 +635,7 @@ def import_files(
     log = pooled(by_role["joints"]) if by_role["joints"] else None
     joined = None
     if log is not None:
-        lack = f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
+        lack = f"{log.source}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         require(log.q.shape[1], lack)
         if log.forces and ("load" in points.texts or points.forces):
             warnings.append(f"{log.source}: its loads are not taken, as the points state theirs")
@@ -656,12 +666,8 @@ def import_files(
                 "correct unit, sign, offset_deg or order in [joints], or the limits of the cell"
             )
         fit = nominal_fit(chain, cell, measured, spherical)
-    warnings += [
-        *told,
-        *(() if joined is None else joined.warnings),
-        *doubts,
-        *plausibility(columns, measured, cell is not None and observe == "deflection"),
-    ]
+    judged = plausibility(columns, measured, cell is not None and observe == "deflection")
+    warnings += [*told, *(joined.warnings if joined else ()), *doubts, *judged]
     warnings += [fit.warning] if fit is not None and fit.warning else []
     return Imported(
         tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
@@ -685,7 +691,8 @@ def _by_role(
         if role in ("joints", "both") and joint_stems(found.numbers):
             found = with_joints(where, found, table.joints, names)
         by_role["joints" if role == "joints" else "points"].append(found)
-        understood.append(found.understood | {"role": role})
+        read = {"role": role, "rows": len({*found.line}), "ignored": sorted(found.ignored)}
+        understood.append(found.understood | read)
     if not by_role["points"]:
         raise InputError(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "

@@ -236,7 +236,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
     bare = re.compile(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""")
     whole = "\n".join(found[0] for line in lines if (found := bare.match(line)))
     ends = [match.start() for match in re.finditer("\n", whole)]
-    rows: list[Line] = []
+    rows: list[tuple[int, dict[str, str]]] = []
     ignored: list[tuple[int, str]] = []
     for offset, name, values in read(whole):
         line = bisect_left(ends, offset) + 1
@@ -258,7 +258,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
         for load in filter(None, map(_MEASURED.match, lines[line : line + 3])):
             if own and load[1] == own[1]:  # at once, or after a stop to change the load
                 kept |= dict(zip(hung, load.groups("0")[1:], strict=True))
-        rows.append((line, [name, *(kept.get(axis, "") for axis in (*axes, *hung))]))
+        rows.append((line, {"name": name} | kept))
     passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
     if not rows:
         raise InputError(
@@ -266,10 +266,9 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
             "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
-    header = ("name", *axes, *hung)
-    used = [i for i in range(len(header)) if not i or any(cells[i] for _, cells in rows)]
-    rows = [(line, [cells[i] for i in used]) for line, cells in rows]
-    return Rows(tuple(header[i] for i in used), rows, ignored, kind.upper())
+    header = tuple(h for h in ("name", *axes, *hung) if any(h in own for _, own in rows))
+    cells = [(line, [own.get(h, "") for h in header]) for line, own in rows]
+    return Rows(header, cells, ignored, kind.upper())
 
 
 # Offset into the text, name, and the values by axis or why there are none.
@@ -318,8 +317,8 @@ UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are s
 class Records:
     """n rows of exported files; `file` (n,) and `line` (n,) say where each stands.  `numbers` stem
     → (n,) in `units[stem]`, the units of the table to be written; `texts` (name, configuration,
-    marker, repeat, load) → n texts; `load` of all rows, where one is stated; `understood`: the
-    command's JSON, `ignored` in it (line, reason) of all passed over; `doubts`: what to warn of."""
+    marker, repeat, load) → n texts; `load` of all rows, where one is stated; `understood`: what was
+    made of the file, for people; `ignored`: line and reason; `doubts`: what to warn of."""
 
     file: list[str]
     line: IntArray
@@ -327,6 +326,7 @@ class Records:
     units: dict[str, str]
     texts: dict[str, list[str]]
     understood: dict[str, Any]
+    ignored: set[tuple[int, str]]
     load: str | None = None
     doubts: Sequence[str] = ()
 
@@ -385,19 +385,6 @@ class Records:
             texts={stem: [own[i] for i in rows] for stem, own in self.texts.items()},
         )
 
-    @classmethod
-    def stacked(cls, parts: Sequence[Records]) -> Records:
-        stems = dict.fromkeys(stem for part in parts for stem in part.texts)
-        return replace(
-            parts[0],
-            file=[file for part in parts for file in part.file],
-            line=np.concatenate([part.line for part in parts]),
-            numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
-            texts={
-                s: [text for p in parts for text in p.texts.get(s, [""] * len(p))] for s in stems
-            },
-        )
-
 
 def joint_stems(numbers: Iterable[str]) -> list[str]:
     found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
@@ -436,14 +423,14 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     texts = {}
     for c in (c for c in next(iter(columns.values())) if not c.quantities):
         glue = " " if c.stem == "time_text" else "::"
-        texts[c.stem] = [glue.join(row[i].strip() for i in c.index) for _, row, _ in kept]
+        texts[c.stem] = [glue.join(row[i].strip() for i in c.index) for _, row, *_ in kept]
         # A load that is a bare size gets the unit in its header.
         if c.stem == "load" and (unit := re.search(UNIT_OF_LOAD, c.header)):
             bare = re.compile(r"[\d.,]+")
             texts["load"] = [f"{t} {unit[1]}" if bare.fullmatch(t) else t for t in texts["load"]]
     if "" not in columns:
-        texts["marker"] = [marker for _, _, marker in kept]
-    line = np.array([number for number, _, _ in kept], dtype=np.int64)
+        texts["marker"] = [marker for _, _, marker, _ in kept]
+    line = np.array([number for number, *_ in kept], dtype=np.int64)
     written = texts.pop("time_text", None)
     if written is not None and "time" not in numbers:
         form = source.time_format or ()
@@ -460,23 +447,26 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         ],
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
                         if i - 1 not in used),
-        "rows": len({*line}), "ignored": tuple(sorted({*table.ignored, *ignored})),
     }  # fmt: skip
     told = f"{name}: column %r states no unit and is not read; name it with one, as %s [%s]"
     doubts = [told % (n, c.stem, next(iter(FACTORS[c.quantities[0]]))) for n, c in no_unit.items()]
-    return Records([name] * len(line), line, numbers, of, texts, understood, source.load, doubts)
+    return Records(
+        [name] * len(line), line, numbers, of, texts, understood, {*table.ignored, *ignored},
+        source.load, doubts,
+    )  # fmt: skip
+
+
+KeptRow = tuple[int, list[str], str, list[float]]  # line, cells, marker, and its numbers
 
 
 def _rows(
     name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]],
     cells: mapping_file.NumberCells, coverage: float,
-) -> tuple[list[tuple[int, list[str], str]], dict[str, Array], dict[str, str],
-           list[tuple[int, str]]]:  # fmt: skip
-    """Complete rows (line, cells, marker), their numbers by column and the units of the measurement
-    table that these are in; what is passed over and why."""
+) -> tuple[list[KeptRow], dict[str, Array], dict[str, str], list[tuple[int, str]]]:  # fmt: skip
+    """Complete rows, their numbers by column and the units of the measurement table that these are
+    in; what is passed over and why."""
     widest = max((c for own in columns.values() for c in own), key=lambda c: max(c.index))
-    kept, ignored = list[tuple[int, list[str], str]](), list[tuple[int, str]]()
-    read: dict[str, list[list[float]]] = {marker: [] for marker in columns}
+    kept, ignored = list[KeptRow](), list[tuple[int, str]]()
     for number, row in table.rows:
         at = max(widest.index) + 1
         what = f"{widest.key} is column {at} ({widest.header})" if at > len(row) else ""
@@ -496,8 +486,7 @@ def _rows(
                     break
                 found.append(value)
             else:
-                kept.append((number, row, marker))
-                read[marker].append(found)
+                kept.append((number, row, marker, found))
     if not kept:
         number, reason = ignored[0]
         raise InputError(
@@ -510,7 +499,7 @@ def _rows(
         for k, c in enumerate(c for c in own if c.quantities):
             sigma = c.stem.startswith("sigma_")
             of[c.stem] = "um" if sigma else next(iter(FACTORS[quantities(c.unit)[0]]))
-            values = np.array([values[k] for values in read[marker]])
+            values = np.array([kept[i][3][k] for i in rows])
             values = convert(values, c.unit, of[c.stem]) / (coverage if sigma else 1.0)
             # Seconds and nanoseconds of a time add up.
             numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += values
@@ -640,12 +629,10 @@ def _with_names_read(where: str, records: Records, names: mapping_file.NamesTabl
                     f"{NAMED} that finds it in every name"
                 )
         present[stem] = [text or unsaid.get(stem, "") for text in texts]
-    reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
+    reasons = {(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad}
     good = np.setdiff1d(np.arange(len(records)), bad)
-    kept = replace(records, texts=present | records.texts).take(good)
-    ignored = tuple(sorted([*records.understood["ignored"], *reasons]))
-    rows = len({*kept.line})
-    return replace(kept, understood=kept.understood | {"rows": rows, "ignored": ignored})
+    made = replace(records, texts=present | records.texts, ignored=records.ignored | reasons)
+    return made.take(good)
 
 
 UNLOADED = ("none", "unloaded", "0")
@@ -705,23 +692,23 @@ def with_loads_of_names(
 ) -> tuple[dict[str, list[Records]], list[str]]:
     """With the loads that their files are named for, hanging straight down, where nothing else
     states any, and what to tell."""
-    made, every = dict(by_role), [r for role in by_role.values() for r in role]
+    every = [r for role in by_role.values() for r in role]
     named = {r.source: load_in(Path(r.source).stem) for r in every}
     # A log's forces are what was planned: names of files win.
     forces = [*by_role["points"], *([] if any(named.values()) else by_role["joints"])]
     if loads or any(r.load or "load" in r.texts for r in every) or any(r.forces for r in forces):
-        return made, []
+        return dict(by_role), []
     if not any(named.values()):
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
         told += [f"column {name} of {r.source}" for r in every
                  for name in r.understood["unused"] if _WORD.search(name)]  # fmt: skip
-        return made, [
+        return dict(by_role), [
             f"{listed(told)}: named for a load that is not taken, and the rows are written "
             "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
             "[source.columns]"
         ] if told else []  # fmt: skip
-    for role, files in by_role.items():
-        made[role] = [replace(r, load=(named[r.source] or UNLOADED[1:])[0]) for r in files]
+    made = {role: [replace(r, load=(named[r.source] or UNLOADED[1:])[0]) for r in files]
+            for role, files in by_role.items()}  # fmt: skip
     if not any(named[r.source] for r in by_role["points"]):
         # The points are those of the joint logs.
         only = {r.load for r in made["joints"]}

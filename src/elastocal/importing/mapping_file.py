@@ -240,9 +240,8 @@ class ColumnKey:
         return not self.required and self.quantities[0] in ("time", "temperature")
 
     def of_marker(self, name: str) -> ColumnKey:
-        if not self.of_each_marker:
-            return self
-        return replace(self, at=(str(self.at[0]).replace(EACH, name),))
+        places = (p.replace(EACH, name) if isinstance(p, str) else p for p in self.at)
+        return replace(self, at=tuple(places))
 
 
 def column_key(where: str, key: str) -> ColumnKey:
