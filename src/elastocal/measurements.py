@@ -191,8 +191,8 @@ class Measurements(Result):
             f"rows are taken by a mask or a slice of {len(self)} rows, or by a list of their "
             f"numbers from 0; found {quoted(index)}",
         )
-        arrays = {name: v for name, v in vars(self).items() if isinstance(v, np.ndarray)}
-        return replace(self, **{name: values[index] for name, values in arrays.items()})
+        held: dict[str, Any] = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **{name: values[index] for name, values in held.items()})
 
     __getitem__ = take  # data[data.marker == 0], data[:90]
     __iter__ = None  # rows have no form of their own
