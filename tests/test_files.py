@@ -42,7 +42,7 @@ def test_a_pipe_or_device_is_refused_and_not_waited_for(tmp_path, reader):
         with pytest.raises(InputError, match=f"is a {kind}.*not a regular file; save the cell"):
             reader(path, "cell", 1000)
         with pytest.raises(InputError, match=f"key robot.dh names .*: is a {kind}"):
-            check_exists(tmp_path / path, "robot.dh", tmp_path / "cell.toml")
+            check_exists(tmp_path / path, "key robot.dh")
 
 
 @pytest.mark.parametrize("kind", NESTED)

@@ -389,9 +389,7 @@ def shown(value: Any) -> str:
     return f"{type(value).__name__}{f' of shape {shape}' if shape else ''}"
 
 
-def whole(name: str, given: Any, least: int | None = None) -> int:
-    more = "" if least is None else f", {least} or more"
-    good = _counted(given) and (least is None or given >= least)
-    told = f"{option(name)} takes a whole number of at most {MOST:,}{more}"
-    require(good, f"{told}; found {quoted(given)}")
+def whole(name: str, given: Any) -> int:
+    told = f"{option(name)} takes a whole number of at most {MOST:,}, 1 or more"
+    require(_counted(given) and given > 0, f"{told}; found {quoted(given)}")
     return int(given)

@@ -117,10 +117,10 @@ class Solid(Record):
             name = known.name
             if name in needed:
                 told = f"key {spot.key(name)} is missing; for a {shape} it takes"
-                spot.require(name in table, f"{told} {known.of(name, known.form).takes}")
+                require(name in table, f"{told} {known.of(name, known.form).takes}")
             elif name in table and (name, shape) != ("scale", "mesh"):
                 told = f"{shape}, which takes {' and '.join(needed)}; drop it"
-                spot.require(False, f"key {spot.key(name)} has no meaning for a {told}")
+                require(False, f"key {spot.key(name)} has no meaning for a {told}")
         size = table.get("scale", np.ones(3))
         if shape != "mesh":
             size = np.hstack([table[name] for name in needed])
@@ -171,7 +171,7 @@ class HangingLoad(Record):
             ("max_angle_deg", "rope_axis", "the direction in which the rope leaves the tool"),
         ):
             told = f"key {spot.key(given)} has no meaning without {spot.key(other)}, {takes}"
-            spot.require(other in table or given not in table, f"{told}; give both or none")
+            require(other in table or given not in table, f"{told}; give both or none")
         return {"solid": from_table(Solid, table, spot, name="load")}
 
 
@@ -249,12 +249,12 @@ class Workspace(Record):
         _check_names(table, spot)
         radius = stated(table, spot, fields_of(cls)["link_radius"])
         geometry = table.get("geometry", "capsules" if radius else "none")
-        spot.require(
+        require(
             radius or geometry != "capsules",
             'key workspace.link_radius_mm is missing; beside geometry = "capsules" it takes a '
             "positive number in mm, or one per link",
         )
-        spot.require(
+        require(
             not radius or geometry == "capsules",
             f"key {spot.key(radius[1]) if radius else ''} has no meaning beside geometry = "
             f'"{geometry}"; drop one of them',
@@ -267,12 +267,12 @@ def _check_names(table: Any, spot: Spot) -> None:
     for kind in ("obstacle", "body", "keep_out"):
         for i, entry in enumerate(table.get(kind, ())):
             here, name = (spot / kind / i).key("name"), getattr(entry, "solid", entry).name
-            spot.require(
+            require(
                 not PARTS.fullmatch(name),
                 f"key {here} is {quoted(name)}, which names a part of the arm or its load; "
                 "choose another",
             )
-            spot.require(
+            require(
                 name not in places,
                 f"key {here} repeats {quoted(name)}, already {places.get(name)}; give every one "
                 "a name of its own",
@@ -292,7 +292,7 @@ def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
     modules = table.modules or ()
     for i, module in enumerate(modules):
         if is_plugin_file(module):
-            check_exists(spot.path.parent / module, f"plugins.modules[{i}]", spot.path)
+            check_exists(spot.path.parent / module, f"key plugins.modules[{i}]")
     return tuple(str(spot.path.parent / m) if is_plugin_file(m) else m for m in modules)
 
 

@@ -96,12 +96,12 @@ class Robot(Record):
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         given = [name for name in SOURCES if name in table]
-        spot.require(given, f"[robot] takes exactly one of {listed(SOURCES)}; none is given")
+        require(given, f"[robot] takes exactly one of {listed(SOURCES)}; none is given")
         of_a_table = ("dh_convention", "masses", "ur_model")
         other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():
             told = f"key robot.{name} has no meaning beside {given[0]}; drop it"
-            spot.require(name not in table, told)
+            require(name not in table, told)
         return {}
 
     @classmethod
@@ -216,13 +216,13 @@ class Tracker(Record):
         polar, cartesian = [name for name in POLAR_KEYS if name in table], "sigma_um" in table
         if not polar:
             return {"noise": from_table(CartesianNoise, table, spot) if cartesian else None}
-        spot.require(
+        require(
             not cartesian,
             f"keys tracker.sigma_um and tracker.{polar[0]} are two styles of noise; keep sigma_um, "
             f"or {', '.join(POLAR_KEYS)}",
         )
         for name in ("range_um", "transverse_um"):
-            spot.require(
+            require(
                 name in table,
                 f"key tracker.{name} is missing; beside tracker.{polar[0]} it takes a positive "
                 "number in µm",
@@ -474,7 +474,7 @@ class Motion(Record):
         given = [stated(table, spot, fields_of(cls)[name]) for name in ("speed", "home")]
         names = [one[1] for one in given if one is not None]
         degrees = [not name.endswith("_si") for name in names]
-        spot.require(
+        require(
             all(degrees) or not any(degrees),
             f"keys {' and '.join(map(spot.key, names))} mix units; give both in degrees, or both "
             "in SI units (_si)",
@@ -618,10 +618,10 @@ class DesignSpec(Record):
         levels = joint_values(given.model_extra or {}, spot, "levels", ("poses_per_level",))
         each, n = given.poses_per_level, sum(map(len, levels.values()))
         told = "key design.levels.poses_per_level has no meaning without levels; name the joint"
-        spot.require(levels or each is None, f"{told}, as in joint2_deg = [-90, -45, 0]")
+        require(levels or each is None, f"{told}, as in joint2_deg = [-90, -45, 0]")
         per_level = (each,) * n if isinstance(each, int) else tuple(each or ())
         poses, told = table.get("poses"), f"[design.levels] sum to {sum(per_level)}; drop one"
-        spot.require(
+        require(
             not per_level or poses in (None, sum(per_level)),
             f"key design.poses is {poses}, but the poses per level in {told} or correct it",
         )

@@ -294,12 +294,10 @@ class Spot:
     def key(self, name: str) -> str:
         return place(*self.keys, name)
 
-    def require(self, condition: object, sentence: str) -> None:
-        require(condition, f"{self.path}: {sentence}")
-
 
 def checked(table: type[Stated], data: Mapping[str, Any], where: str | Path) -> Stated:
-    found: Stated = _table(table, data, Spot(where, root=table), "a table")
+    with said_of(where):
+        found: Stated = _table(table, data, Spot(where, root=table), "a table")
     return found
 
 
@@ -309,7 +307,7 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     more = cls.model_config.get("extra") if issubclass(cls, BaseModel) else more
     others = [name for name in data if name not in known]
     for name in others if more == "forbid" else ():
-        raise InputError(f"{spot.path}: {_unknown(cls, name, data[name], spot)}")
+        raise InputError(_unknown(cls, name, data[name], spot))
     for name in others if more == "allow" else ():
         kind = get_args(get_type_hints(cls, include_extras=True)["__pydantic_extra__"])[1]
         found[name] = _value(kind, data[name], spot / name, takes, did_you_mean(name, known))
@@ -317,7 +315,7 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
         in_a_unit = all(one.required for one in keys) and any(one.name in data for one in keys)
         for one in keys:
             told = f"key {spot.key(one.name)} is missing; it takes {one.takes}"
-            spot.require(one.name in data or in_a_unit or not one.required, told)
+            require(one.name in data or in_a_unit or not one.required, told)
             if one.name in data:
                 found[one.name] = _value(one.kind, data[one.name], spot / one.name, one.takes)
     if issubclass(cls, BaseModel):
@@ -357,7 +355,7 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
     if problem == "literal_error" and isinstance(found, str):
         hint = did_you_mean(found, re.findall(r'"(\w+)"', takes))
     takes = takes.replace("[[…]]", f"[[{place(*keys)}]]")
-    raise InputError(f"{spot.path}: key {place(*keys)} takes {takes}; found {shown(found)}{hint}")
+    raise InputError(f"key {place(*keys)} takes {takes}; found {shown(found)}{hint}")
 
 
 def from_table(cls: type[Stated], table: Mapping[str, Any], spot: Spot, **values: Any) -> Stated:
@@ -369,8 +367,7 @@ def from_table(cls: type[Stated], table: Mapping[str, Any], spot: Spot, **values
     for name, keys in fields_of(known).items():
         if name not in values and (given := stated(table, spot, keys)):
             values[name] = given[0]
-    with said_of(spot.path):
-        return cls(**values)
+    return cls(**values)
 
 
 def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
@@ -378,7 +375,7 @@ def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[A
     given = [known for known in keys if known.name in table]
     if len(given) > 1:
         names = " and ".join(spot.key(known.name) for known in given)
-        raise InputError(f"{spot.path}: {names} say the same in two units; keep one of them")
+        raise InputError(f"{names} say the same in two units; keep one of them")
     if not given:
         return None
     known = given[0]
@@ -392,7 +389,7 @@ def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[A
     for name, value in values.items() if UNITS[unit][1] == "m" else ():
         far = float(np.max(np.abs(value), initial=0.0))
         here = spot.key(known.name) + (f".{dotted((name,))}" if several else "")
-        spot.require(far <= FARTHEST, f"key {here}: {far:g} m reaches beyond any cell; correct it")
+        require(far <= FARTHEST, f"key {here}: {far:g} m reaches beyond any cell; correct it")
     return values if several else values[""], known.name
 
 
@@ -410,11 +407,11 @@ def joint_values(
                 f"; missing unit: {' or '.join(f'{key}_{u}' for u in JOINT_UNITS)}"
             )
             raise InputError(
-                f"{spot.path}: unknown key {above}.{dotted((key,))}{hint}; [{above}] takes "
+                f"unknown key {above}.{dotted((key,))}{hint}; [{above}] takes "
                 "keys such as joint1_deg or joint1_rad, for a prismatic joint joint3_m or joint3_mm"
             )
         joint, unit = match.groups()
-        spot.require(joint not in values, f"[{above}] gives {joint} in two units; keep one of them")
+        require(joint not in values, f"[{above}] gives {joint} in two units; keep one of them")
         values[joint] = tuple(to_si(float(v), unit) for v in stated_values)
     return values
 
@@ -543,7 +540,7 @@ def _direction(value: object) -> Array:
 
 
 def existing_file(found: str, spot: Spot, name: str) -> Path:
-    return check_exists(spot.path.parent / found, spot.key(name), spot.path)
+    return check_exists(spot.path.parent / found, f"key {spot.key(name)}")
 
 
 def _as_tuple(value: object) -> object:

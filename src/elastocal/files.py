@@ -146,13 +146,12 @@ def decoded(
         ) from None
 
 
-def check_exists(path: Path, key: str, owner: Path) -> Path:
-    """`path`, which `key` of the file `owner` names, where it is an existing file."""
+def check_exists(path: Path, key: str) -> Path:
+    """`path`, which the `key` of a cell names, where it is an existing file."""
     try:
         check_regular(path, "file")
     except InputError as error:
-        told = f"{owner}: key {key} names {error}; paths are relative to the cell file"
-        raise InputError(told) from None
+        raise InputError(f"{key} names {error}; paths are relative to the cell file") from None
     return path
 
 
@@ -309,18 +308,18 @@ def load_plugins(
     for k, name in enumerate(modules):
         if _has_run(name, fresh):
             continue
-        key = f"plugins.modules[{k}]"
+        key = f"{owner}: key plugins.modules[{k}]"
         what = f"the Python file {name}" if is_plugin_file(name) else f"the module {name!r}"
         require(
             asked or _trusted(owner),
-            f"{owner}: key {key} names {what}, which runs with your rights and so not unasked; "
+            f"{key} names {what}, which runs with your rights and so not unasked; "
             f"read it, then say {option('plugins', True)}, or set {TRUSTED}="
             f"{owner.absolute().parent} for all cells of this folder",
         )
         if is_plugin_file(name):
-            _run_file(check_exists(Path(name), key, owner), f"{owner}: key {key}")
+            _run_file(check_exists(Path(name), key), key)
         else:
-            with _running(f"{owner}: key {key}"):
+            with _running(key):
                 _import(name)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -191,12 +191,8 @@ class Measurements(Result):
             f"rows are taken by a mask or a slice of {len(self)} rows, or by a list of their "
             f"numbers from 0; found {quoted(index)}",
         )
-        changes = {
-            f.name: getattr(self, f.name)[index]
-            for f in fields(self)
-            if isinstance(getattr(self, f.name), np.ndarray)
-        }
-        return replace(self, **changes)
+        held: dict[str, Any] = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
+        return replace(self, **{name: values[index] for name, values in held.items()})
 
     __getitem__ = take  # data[data.marker == 0], data[:90]
     __iter__ = None  # rows have no form of their own

@@ -200,11 +200,8 @@ def load(path: str | Path, cell: str | Path | None = None) -> Model | Calibrated
     path, kind = Path(path), Path(path).suffix.lower()
     if kind == ".toml":
         return Model(path)
-    require(
-        kind in (".json", ".csv", ".parquet", ".pq"),
-        f"{path}: give a cell file (.toml), a result of identify (.json) or a table (.csv, "
-        ".parquet)",
-    )
+    told = "give a cell file (.toml), a result of identify (.json) or a table (.csv, .parquet)"
+    require(kind in (".json", ".csv", *PARQUET), f"{path}: {told}")
     of = path.parent / "cell.toml" if cell is None else Path(cell)
     require(
         cell is not None or of.is_file(),

@@ -247,7 +247,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         found = wish.of_candidates(chosen["candidates"])
         require(found is not None, f"{option('candidates')} {told}")
         given, taught = found or (None, None)
-        given = None if given is None else whole("candidates", given, 1)
+        given = None if given is None else whole("candidates", given)
         chosen |= {"candidates": given, "taught": None if taught is None else Path(taught)}
     wishes = [key for key in ("poses", "target", "minutes") if key in chosen]
     told = "a target or a time asks for the number of poses; drop one"
@@ -356,7 +356,7 @@ def simulated(
     force = given_force(load)
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
-    repeats = whole("repeats", repeats, 1)
+    repeats = whole("repeats", repeats)
     if isinstance(plan, str | Path) or hasattr(plan, "to_csv"):
         poses = made.read_plan(plan)
     elif type(plan).__name__ == "Plan":
@@ -544,7 +544,7 @@ def diagnose(
 
     options = DiagnosisOptions(cast(int, seed), _names(without), false_alarm)
     if extra_poses is not None:
-        whole("extra_poses", extra_poses, 1)
+        whole("extra_poses", extra_poses)
     tell = progress or _silent
     tell("reading")
     made = _model(model)

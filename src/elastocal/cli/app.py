@@ -1,13 +1,13 @@
 """What all commands share: the app, errors and exit codes, outputs, and how a command is declared.
 
     @command(verb=verbs.identify, offers="test method noise fixed seed")
-    def identify(cell: CellFile, data: DataFile, report: ReportFile, asked: Asked, run: Run): ...
+    def identify(cell: Path, data: Path, asked: Asked, report: Path | None = None, run: Run): ...
 
 In place of `asked` stand the options that the verb `offers`: name, kind and default are those of
 its argument, the help is the first sentence of what its docstring says of that.  In place of `run`
 stand the flags that all commands have.  All others are arguments, and where they have a default
 options, of the command itself: the help of each stands under Args in its docstring, in brackets
-what stands for a value, as in "set_ (KEY=VALUE): Option of the study".
+what stands for a value, as in "set_ (KEY=VALUE): Option of the study", unless it is `KNOWN`.
 """
 
 from __future__ import annotations
@@ -196,23 +196,21 @@ Asked: TypeAlias = dict[str, Any]
 # Metavar and meaning of an option that is another thing as a text than in Python.
 Texts: TypeAlias = Mapping[str, tuple[str, Callable[[Any], Any]]]
 
-CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, tracker, model.")]
-DataFile = Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")]
-ResultFile = Annotated[Path, typer.Argument(help="Result of identify -o (JSON).")]
-ReportFile = Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")]
 PAGES = ".html .htm"  # endings
-Output = Annotated[Path, typer.Option("-o", "--output")]
-AnyOutput = Annotated[Path | None, typer.Option("-o", "--output")]
-JsonFile = Annotated[Path | None, typer.Option("-o", "--output", help="Write the result as JSON.")]
-SEED = typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random draws.")
-Seed = Annotated[int, SEED]
-FLAGS = {
+# Arguments and options that are the same in all commands, unless one says otherwise.
+KNOWN: dict[str, Any] = {
+    "cell": typer.Argument(help="Cell file (TOML): robot, tool, tracker, model."),
+    "data": typer.Argument(help="Measurements (CSV or Parquet)."),
+    "result": typer.Argument(help="Result of identify -o (JSON)."),
+    "output": typer.Option("-o", "--output", help="Write the result as JSON."),
+    "report": typer.Option("--report", help="Write a report (one HTML page)."),
+    "seed": typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random draws."),
     "plugins": typer.Option(
         "--plugins", help="Run the Python code that the cell names in [plugins]."
     ),
     "json": typer.Option("--json", help="Print the result as JSON to stdout."),
     "quiet": typer.Option("--quiet", "-q", help="No progress."),
-}  # fmt: skip
+}
 FORCE = tuple[float, float, float]
 # What an argument may be in Python → what it is here; of several the first.
 TAKEN: dict[str, Any] = {
@@ -305,7 +303,7 @@ def command(
             if each.name == "asked":
                 parameters += offered.values()
             elif each.name == "run":
-                parameters += [_parameter(n, bool, False, FLAGS[n]) for n in flags.split()]
+                parameters += [_parameter(n, bool, False, KNOWN[n]) for n in flags.split()]
             else:
                 parameters.append(_own(each, *told.get(each.name, ("", None))))
 
@@ -350,18 +348,20 @@ def _offered(
         idle = help.startswith("Has no effect")  # taken where scripts give it
         option = typer.Option(flag_of(name), metavar=metavar, help=help, hidden=idle)
         kind = taken | None if default is None else taken
-        yield name, _parameter(name, kind, default, SEED if name == "seed" else option)
+        yield name, _parameter(name, kind, default, KNOWN.get(name, option))
 
 
 def _own(each: inspect.Parameter, help: str, metavar: str | None) -> inspect.Parameter:
     kind, stated = each.annotation, getattr(each.annotation, "__metadata__", ())
     if stated:
         kind, option = get_args(each.annotation)[0], copy(stated[0])
+    elif each.name in KNOWN:
+        option = copy(KNOWN[each.name])
     elif each.default is inspect.Parameter.empty:
         option = typer.Argument()
     else:
         option = typer.Option(flag_of(each.name.rstrip("_")))
-    option.help, option.metavar = option.help or help, option.metavar or metavar
+    option.help, option.metavar = help or option.help, option.metavar or metavar
     if FORCE in (kind, *get_args(kind)):
         option.metavar = "X Y Z"
     return _parameter(each.name, kind, each.default, option)

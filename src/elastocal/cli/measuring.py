@@ -14,11 +14,7 @@ import typer
 from elastocal import verbs
 from elastocal.cli.app import (
     PAGES,
-    AnyOutput,
     Asked,
-    CellFile,
-    Output,
-    ReportFile,
     Run,
     command,
     files_of,
@@ -42,7 +38,7 @@ if TYPE_CHECKING:
 
 @command(short_help="Write a working cell file for my arm", flags="")
 def init(
-    robot: Path, output: Output = Path("cell.toml"), base: str | None = None,
+    robot: Path, output: Path = Path("cell.toml"), base: str | None = None,
     flange: str | None = None, convention: str = "standard", ur_model: str | None = None,
     force: bool = False, *, run: Run,
 ) -> None:  # fmt: skip
@@ -157,8 +153,8 @@ def _candidates(text: str) -> int | str | list[int | str]:
     },
 )
 def design(
-    cell: CellFile, output: Output, *, asked: Asked, program: list[Path] | None = None,
-    picture: Path | None = None, cell_out: Path | None = None, report: ReportFile = None, run: Run,
+    cell: Path, output: Path, *, asked: Asked, program: list[Path] | None = None,
+    picture: Path | None = None, cell_out: Path | None = None, report: Path | None = None, run: Run,
 ) -> None:  # fmt: skip
     """Which poses should I measure?
 
@@ -303,7 +299,7 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     offers="draw load repeats seed",
 )
 def simulate(
-    cell: CellFile, plan: Path, output: Output, set_: list[str] | None = None,
+    cell: Path, plan: Path, output: Path, set_: list[str] | None = None,
     truth: Path | None = None, no_noise: bool = False, *, asked: Asked, run: Run,
 ) -> None:  # fmt: skip
     """Simulate measurements from the cell's model, with chosen errors and noise.
@@ -348,10 +344,11 @@ def simulate(
     flags="json",
 )
 def import_(
-    files: Annotated[list[Path] | None, typer.Argument()] = None, output: AnyOutput = None,
+    files: Annotated[list[Path] | None, typer.Argument()] = None, output: Path | None = None,
     mapping: Annotated[Path | None, typer.Option("--map")] = None, preset: list[str] | None = None,
-    show_preset: str | None = None, preview: bool = False, cell: Path | None = None,
-    length_unit: str | None = None, angle_unit: str | None = None, *, run: Run,
+    show_preset: str | None = None, preview: bool = False,
+    cell: Annotated[Path | None, typer.Option()] = None, length_unit: str | None = None,
+    angle_unit: str | None = None, *, run: Run,
 ) -> None:  # fmt: skip
     """Convert exports of a laser tracker and joint logs to the measurement table.
 

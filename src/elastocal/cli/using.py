@@ -17,16 +17,8 @@ from elastocal import verbs
 from elastocal.cli.app import (
     FORCE,
     PAGES,
-    AnyOutput,
     Asked,
-    CellFile,
-    DataFile,
-    JsonFile,
-    Output,
-    ReportFile,
-    ResultFile,
     Run,
-    Seed,
     command,
     named_numbers,
     repeated,
@@ -46,7 +38,7 @@ if TYPE_CHECKING:
     "outliers jobs seed",
 )
 def identify(
-    cell: CellFile, data: DataFile, output: JsonFile = None, report: ReportFile = None,
+    cell: Path, data: Path, output: Path | None = None, report: Path | None = None,
     certificate: Path | None = None, residuals: Path | None = None,
     require: list[str] | None = None, *, asked: Asked, details: bool = False, run: Run,
 ) -> None:  # fmt: skip
@@ -104,7 +96,7 @@ MOST_POSES = 10
 
 @command(verb=verbs.diagnose, offers="without seed")
 def diagnose(
-    cell: CellFile, data: DataFile, output: JsonFile = None, report: ReportFile = None,
+    cell: Path, data: Path, output: Path | None = None, report: Path | None = None,
     plan: Path | None = None, poses: Annotated[int | None, typer.Option(min=1)] = None,
     cell_out: Path | None = None, *, asked: Asked, run: Run,
 ) -> None:  # fmt: skip
@@ -181,10 +173,10 @@ def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> st
 
 @command("next")
 def next_command(
-    cell: CellFile, data: DataFile, output: Output, batch: Annotated[int, typer.Option(min=1)] = 5,
+    cell: Path, data: Path, output: Path, batch: Annotated[int, typer.Option(min=1)] = 5,
     required: Annotated[str | None, typer.Option("--require")] = None,
     least_gain: Annotated[float, typer.Option(min=0, max=99)] = 1.0,
-    candidates: Annotated[int, typer.Option(min=1)] = 400, jobs: int = 1, seed: Seed = 0, *,
+    candidates: Annotated[int, typer.Option(min=1)] = 400, jobs: int = 1, seed: int = 0, *,
     run: Run,
 ) -> None:  # fmt: skip
     """Which poses should I measure next, or are these enough?
@@ -230,8 +222,8 @@ GRID = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
 
 @command(verb=verbs.compensate, offers="frame point load seed", texts={"point": ("POINT", str)})
 def compensate(
-    cell: CellFile, result: ResultFile, targets: Annotated[Path | None, typer.Argument()] = None,
-    output: AnyOutput = None, target: str | None = None, near: str | None = None,
+    cell: Path, result: Path, targets: Annotated[Path | None, typer.Argument()] = None,
+    output: Path | None = None, target: str | None = None, near: str | None = None,
     partial: bool = False, table: Path | None = None, grid: str = "5", box: str | None = None,
     rotation: str | None = None, *, asked: Asked, run: Run,
 ) -> None:  # fmt: skip
@@ -311,11 +303,11 @@ def compensate(
 
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
 def export(
-    cell: CellFile, result: ResultFile, output: Output, format: str | None = None,
+    cell: Path, result: Path, output: Path, format: str | None = None,
     load: FORCE | None = None, frames: Annotated[bool, typer.Option("--frames/--no-frames")] = True,
     base_frame: bool = False, joint_correction: Path | None = None,
     temperature_c: float | None = None, time_s: float | None = None,
-    poses: Annotated[int, typer.Option(min=2, max=1_000_000)] = 500, seed: Seed = 0, *, run: Run,
+    poses: Annotated[int, typer.Option(min=2, max=1_000_000)] = 500, seed: int = 0, *, run: Run,
 ) -> None:  # fmt: skip
     """Write the calibrated arm as URDF, MJCF, DH table or parameters, and state the loss.
 
@@ -361,9 +353,9 @@ def export(
 def compare(
     cell: Path, old: Path, new: Annotated[Path | None, typer.Argument()] = None,
     cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
-    output: JsonFile = None, report: ReportFile = None, load: FORCE | None = None,
+    output: Path | None = None, report: Path | None = None, load: FORCE | None = None,
     level: float = 0.05, poses: Annotated[int, typer.Option(min=2, max=100_000)] = 300,
-    seed: Seed = 0, *, run: Run,
+    seed: int = 0, *, run: Run,
 ) -> None:  # fmt: skip
     """What has changed between two calibrations: by parameter, and how far the tool moved.
 
@@ -420,7 +412,7 @@ def study(
     cluster: str | None = None, tls_ca: Path | None = None, tls_cert: Path | None = None,
     tls_key: Path | None = None, unencrypted: bool = False,
     seed: Annotated[int | None, typer.Option(min=0)] = None, set_: list[str] | None = None,
-    output: AnyOutput = None,
+    output: Path | None = None,
     progress: Annotated[bool, typer.Option("--progress", show_default=False)] = True,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", "--no-progress")] = False,
     only: Annotated[int | None, typer.Option(min=1)] = None, restart: bool = False,
@@ -514,22 +506,22 @@ def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
 
 
 @command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
-def demo(folder: Output = Path("demo_out"), seed: Seed = 2013, *, run: Run) -> None:
+def demo(output: Path = Path("demo_out"), seed: int = 2013, *, run: Run) -> None:
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
     Example: elastocal demo -o demo_out
 
     Args:
-        folder: Folder for the example's files, data, result and report.
+        output: Folder for the example's files, data, result and report.
     """
     from elastocal.files import together
     from elastocal.report.renderers import print_report, write_page
     from elastocal.simulation import run_demo
 
-    result, report = folder / "result.json", folder / "report.html"
+    result, report = output / "result.json", output / "report.html"
     with run.progress() as progress:
-        found, truth, published = run_demo(folder, seed, progress)
-        inputs = [folder / name for name in ("cell.toml", "plan.csv", "data.csv")]
+        found, truth, published = run_demo(output, seed, progress)
+        inputs = [output / name for name in ("cell.toml", "plan.csv", "data.csv")]
         with together():
             found.save(result)
             write_page(found, report, inputs, repeated(), seed, truth=truth, published=published)

@@ -154,7 +154,7 @@ class Bounds(Record):
     def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, float]:
         name = quoted(table["parameter"])
         told = f"the bounds of {name} state neither lower nor upper; state one"
-        spot.require({"lower", "upper"} & {*table}, told)
+        require({"lower", "upper"} & {*table}, told)
         return {}
 
     def __post_init__(self) -> None:
@@ -399,8 +399,7 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
 
 def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> GaussianPrior | None:
     means, std = ([getattr(p, key) for p in tables.values()] for key in ("mean", "std"))
-    with said_of(spot.path):
-        return GaussianPrior.independent(tuple(tables), means, std) if tables else None
+    return GaussianPrior.independent(tuple(tables), means, std) if tables else None
 
 
 class Knowledge(Record):

@@ -131,10 +131,6 @@ class DesignOptions:
             self.jobs == -1 or self.jobs >= 1,
             f"{option('jobs')} takes a number of processes, or -1 for all cores; found {self.jobs}",
         )
-        require(
-            all(n >= 1 for n in self.curve),
-            f"{option('curve')} takes numbers of poses, found {self.curve}",
-        )
 
 
 MOST_POSES = 100  # that a target is sought with
