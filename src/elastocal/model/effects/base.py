@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from elastocal.above import later
 from elastocal.cell import Cell
 from elastocal.files import REGISTERED, check_registered
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
@@ -22,6 +23,8 @@ from elastocal.units import Array, pose_at
 
 if TYPE_CHECKING:
     from elastocal.model.effects.smooth import SmoothFunction
+else:
+    globals().update(later("elastocal.model.effects.smooth SmoothFunction"))
 
 
 @dataclass(frozen=True)
