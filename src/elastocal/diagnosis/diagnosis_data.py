@@ -30,7 +30,7 @@ from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit
 from elastocal.messages import InsufficientDataError
-from elastocal.model.effects.base import Setting, Stage, usual_sizes
+from elastocal.model.effects.base import Setting, Stage
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.effects.statics import PayloadError
@@ -40,6 +40,7 @@ from elastocal.units import Array, BoolArray, IntArray
 
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
+UNSIZED_SIGNAL = 2e-4  # m rms; what a parameter of unknown typical size moves the readings by
 
 
 @dataclass(frozen=True)
@@ -126,8 +127,14 @@ class DiagnosisData:
         }  # fmt: skip
 
     def sizes_in(self, h: Hypothesis, rows: Array) -> Array:
-        """Its typical sizes by columns (n_rows, size, k), what is only planned not counted."""
-        return usual_sizes(h.parameters, self.base.observed.apply(rows)[: self.base.n_measured])
+        """Prior standard deviations (k,): typical sizes, else the values whose signal in its
+        columns (n_rows, size, k) is UNSIZED_SIGNAL rms, what is only planned not counted."""
+        columns = self.base.observed.apply(rows)[: self.base.n_measured]
+        flat = columns.reshape(-1, columns.shape[-1])
+        rms = np.sqrt((flat**2).sum(axis=0) / max(int(flat.any(axis=1).sum()), 1))
+        signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
+        both = zip(signal, h.parameters, strict=True)
+        return np.array([s if p.typical is None else p.typical for s, p in both])
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:

@@ -26,7 +26,7 @@ from elastocal.diagnosis.baseline import (
     project,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
+from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Grams, Item, Scan
 from elastocal.diagnosis.hypotheses import (
     ANY_SCALES,
     NO_SETTINGS,
@@ -35,7 +35,6 @@ from elastocal.diagnosis.hypotheses import (
     with_keys,
 )
 from elastocal.diagnosis.noise_floor import left_out_square
-from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.effects.geometry import Backlash
 from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model

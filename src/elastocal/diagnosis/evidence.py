@@ -16,7 +16,6 @@ from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
 
@@ -113,9 +112,9 @@ def evidence_of_groups(
     return best.tolist()
 
 
-# SOMETHING that anything is missing; of that a twentieth that the catalogue lacks it.
-# A second effect beside a first is rarer.
-UNKNOWN, ANOTHER = 0.05, 0.2
+# Probability that anything is missing; of that a twentieth that the catalogue lacks it, else it is
+# each effect in equal shares, at each of its places.  A second effect beside a first is rarer.
+SOMETHING, UNKNOWN, ANOTHER = 0.5, 0.05, 0.2
 
 
 def log_prior_odds(

@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from elastocal.above import later
 from elastocal.cell import Cell
 from elastocal.files import REGISTERED, check_registered
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
@@ -22,6 +23,8 @@ from elastocal.units import Array, pose_at
 
 if TYPE_CHECKING:
     from elastocal.model.effects.smooth import SmoothFunction
+else:
+    globals().update(later("elastocal.model.effects.smooth SmoothFunction"))
 
 
 @dataclass(frozen=True)
@@ -90,22 +93,6 @@ class Parameter(ParameterSpec):
 
     def beyond(self, interval: tuple[float, float]) -> bool:
         return interval[1] < self.lower or interval[0] > self.upper
-
-
-# What a parameter of unknown typical size moves the readings by, rms in m.
-UNSIZED_SIGNAL = 2e-4
-
-
-def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
-    """Prior standard deviation (k,) of each parameter: its typical size, else the value whose
-    signal in the columns (…, k) is UNSIZED_SIGNAL rms."""
-    flat = columns.reshape(-1, columns.shape[-1])
-    if all(p.typical is not None for p in specs):
-        flat = flat[:0]
-    rms = np.sqrt((flat**2).sum(axis=0) / max(int(flat.any(axis=1).sum()), 1))
-    signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
-    both = zip(signal, specs, strict=True)
-    return np.array([s if p.typical is None else p.typical for s, p in both])
 
 
 @dataclass(frozen=True, eq=False)  # a key, whatever its axis and law are made of

@@ -46,8 +46,6 @@ CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
     geometry.DistanceSensor(), geometry.TrackerDistortion(),
 )}  # fmt: skip
 BUILT_IN = frozenset(CATALOGUE)
-# Probability that an effect is missing; in equal shares it is each of them, at each of its places.
-SOMETHING = 0.5
 UNKNOWN = Effect()  # what is known of an effect that the catalogue does not have
 
 
