@@ -83,11 +83,6 @@ class DesignProblem:
     def restricted(self, kept: IntArray) -> DesignProblem:
         return replace(self, blocks=self.blocks[kept], group=self.group[kept])
 
-    def judged_by(self, criterion: ScenarioCriterion) -> DesignProblem:
-        other = replace(self, criterion=criterion)
-        other.__dict__["products"] = self.products
-        return other
-
     def balancing(self) -> Array:
         """T (p, p): parameters z, y = T z, whose information at even weights is 1.  Where base,
         markers and geometry are identified together, an update of Φ by one pose would keep no
@@ -208,8 +203,9 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
     # Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379).
     weights, rounds = problem.even(), list[Relaxed]()
     weights = weights if start is None else EVEN * weights + (1 - EVEN) * start
-    soft = problem.judged_by(problem.criterion.softened(1.0))  # of a kink all sides count
-    weights = weights * np.sqrt(np.maximum(soft.worth(inverse(problem.at(weights)))[1], 0.0))
+    V = inverse(problem.at(weights))
+    _, C = problem.criterion.softened(1.0).slope(V)  # of a kink all sides count
+    weights = weights * np.sqrt(np.maximum(problem.prices(V @ C @ V), 0.0))
     least = problem.shares + 2  # of a group: as its share takes, and a choice
     sizes = np.where(
         problem.shares > 0,
@@ -423,7 +419,7 @@ def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = N
     if problem.criterion.certifiable:
         return relax(problem, gap, start)
     volume = DeterminantCriterion(np.eye(len(problem.prior)))
-    return replace(relax(problem.judged_by(volume), max(gap, 1e-3), start), bound=0.0)
+    return replace(relax(replace(problem, criterion=volume), max(gap, 1e-3), start), bound=0.0)
 
 
 def exact_plan(
@@ -441,7 +437,8 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
     """Exchanges on the softened criterion first, where Φ has kinks: what lowers a maximum is shut
     out wherever two of its arguments are equal and each exchange raises one of them."""
     if problem.criterion.kinked:
-        plan, _ = exchange(problem.judged_by(problem.criterion.softened(SOFT)), plan, LOOKS)
+        soft = replace(problem, criterion=problem.criterion.softened(SOFT))
+        plan, _ = exchange(soft, plan, LOOKS)
     return exchange(problem, plan, LOOKS)
 
 
