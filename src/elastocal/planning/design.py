@@ -76,7 +76,7 @@ from elastocal.planning.poses import (
     shares_of,
     test_poses,
 )
-from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
+from elastocal.planning.relaxation import DesignProblem, relax, sized_plans
 from elastocal.planning.search import (
     EFFORTS,
     POOL,
@@ -425,7 +425,7 @@ class _Design:
 
         n = low + bisect_left(
             range(low, most + 1), True,
-            key=lambda n: prospects(problem_of(n).balanced(), 1e-3).bound <= target,
+            key=lambda n: relax(problem_of(n).balanced(), 1e-3).bound <= target,
         )  # fmt: skip
         if n > most:
             value, _ = sized_plans(problem_of, [most], self.options.seed, self.progress)[most]

@@ -192,9 +192,12 @@ class Relaxed:
 
 def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) -> Relaxed:
     """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l], of a `balanced`
-    problem of a certifiable criterion.  `start` (N,) ≥ 0: weights near the optimum, as those of a
-    smaller pool.  Where rounding forbids the `gap` that is asked for, the bound holds all the
-    same."""
+    problem.  `start` (N,) ≥ 0: weights near the optimum, as those of a smaller pool.  Where
+    rounding forbids the `gap` that is asked for, the bound holds all the same.  Of a criterion that
+    is not certifiable it is that of D over all parameters, which bounds nothing."""
+    if not problem.criterion.certifiable:
+        volume = replace(problem, criterion=DeterminantCriterion(np.eye(len(problem.prior))))
+        return replace(relax(volume, max(gap, 1e-3), start), bound=0.0)
     size = np.bincount(problem.group, minlength=len(problem.shares))
     full = (size == problem.shares)[problem.group]
     if full.any():
@@ -413,15 +416,6 @@ def with_poses(V: Array, B: Array) -> Array:
     return np.asarray(V - BV.swapaxes(-1, -2) @ np.linalg.solve(K, BV))
 
 
-def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = None) -> Relaxed:
-    """The relaxation, whose weights begin plans and whose tangent prices candidates; of a criterion
-    that has none that of D over all parameters, which bounds nothing."""
-    if problem.criterion.certifiable:
-        return relax(problem, gap, start)
-    volume = DeterminantCriterion(np.eye(len(problem.prior)))
-    return replace(relax(replace(problem, criterion=volume), max(gap, 1e-3), start), bound=0.0)
-
-
 def exact_plan(
     problem: DesignProblem, relaxed: Relaxed, *, starts: int = 2, seed: int = 0,
     warm: IntArray | None = None,
@@ -452,7 +446,7 @@ def sized_plans(
         whole = problem_of(n)
         whole.check_enough()
         problem = whole.balanced()
-        relaxed = prospects(problem, start=weights)
+        relaxed = relax(problem, start=weights)
         chosen, _ = exact_plan(problem, relaxed, warm=chosen, seed=seed)
         value, weights = whole.value(chosen), relaxed.weights
         whole.check_determined(value)

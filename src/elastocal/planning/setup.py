@@ -58,7 +58,7 @@ from elastocal.planning.plan import (
     remaining_rms,
 )
 from elastocal.planning.poses import Candidates, TargetPoses, draw, known_rows, shares_of, sobol
-from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, prospects, relax
+from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, relax
 from elastocal.simulation import expand_plan, simulate
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -524,7 +524,7 @@ class Choice:
             else:
                 setup, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
             pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
-            relaxed = prospects(setup.problem(pool, shares).balanced(), GAIN / 10)
+            relaxed = relax(setup.problem(pool, shares).balanced(), GAIN / 10)
         except InsufficientDataError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, tried.feasible / tried.tried)
@@ -714,7 +714,7 @@ def chosen_states(
     def relaxed(ways: IntArray) -> tuple[float, Array]:
         own = replace(setup, ways=ways)
         problem = own.problem(own.pool(q[few], group[few]), shares).balanced()
-        weights = prospects(problem, GAIN / 3).weights
+        weights = relax(problem, GAIN / 3).weights
         value = float(problem.criterion.of_information(problem.at(weights)))
         return value, weights.reshape(len(ways), -1).sum(axis=1)
 
