@@ -34,7 +34,7 @@ def all_values(problem):
 
 def by_cone(problem, name):
     """The relaxed optimum by clarabel (Boyd & Vandenberghe, Convex Optimization, ch. 7.5)."""
-    A, one = problem.matrices(np.arange(len(problem.blocks))), problem.criterion
+    A, one = problem.products.reshape(-1, *problem.prior.shape), problem.criterion
     w = cp.Variable(len(A), nonneg=True)
     p = A.shape[1]
     M = problem.prior + cp.reshape(A.reshape(len(A), -1).T @ w, (p, p), order="C")

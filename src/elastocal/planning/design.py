@@ -76,7 +76,7 @@ from elastocal.planning.poses import (
     shares_of,
     test_poses,
 )
-from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
+from elastocal.planning.relaxation import DesignProblem, relax, sized_plans
 from elastocal.planning.search import (
     EFFORTS,
     POOL,
@@ -245,13 +245,11 @@ class _Design:
         if not effects:
             return
         self.warnings.append(told)
-        model = self.model
-        gone = {k for k, p in enumerate(model.parameters) if p.effect in effects}
-        meant = {name: set(model.meant_by(name)) for name in self.options.fixed}
-        fixed = tuple(name for name, of in meant.items() if not of or not of <= gone)
-        self.options = replace(self.options, fixed=fixed)
-        rest = tuple(c for c in model.cell.model.effects if c.name not in effects)
-        self.model = model.with_effects(rest)
+        before = self.model
+        rest = tuple(c for c in before.cell.model.effects if c.name not in effects)
+        self.model = before.with_effects(rest)
+        held = (n for n in self.options.fixed if self.model.meant_by(n) or not before.meant_by(n))
+        self.options = replace(self.options, fixed=tuple(held))
 
     def run(self) -> Plan:
         plan = self._chosen()
@@ -423,7 +421,7 @@ class _Design:
 
         n = low + bisect_left(
             range(low, most + 1), True,
-            key=lambda n: prospects(problem_of(n).balanced(), 1e-3).bound <= target,
+            key=lambda n: relax(problem_of(n).balanced(), 1e-3).bound <= target,
         )  # fmt: skip
         if n > most:
             value, _ = sized_plans(problem_of, [most], self.options.seed, self.progress)[most]

@@ -210,23 +210,19 @@ class EnoughMarkers(Rule):
         return dict(zip(self.markers, ~self.seen(poses).T, strict=True))
 
 
-class StaticTorque:
+def static_torque(cell: Cell, chain: Chain) -> Callable[[Poses], Array]:
     """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest, V the
     potential of force, link weights and gravity compensator at the rigid pose and nominal
     values."""
-
-    def __init__(self, cell: Cell, chain: Chain) -> None:
-        kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
-        model = replace(cell.model, effects=kept, observe="position")
-        tool = replace(cell.tool, markers={"tool": np.zeros(3)})
-        symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
-        arm, nominal = symbolic.arm, ca.DM([p.nominal for p in symbolic.parameters])
-        torque = ca.gradient(arm.potential, arm.q_commanded)
-        torque = ca.substitute(torque, symbolic.p, nominal)
-        self._compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"]], [torque])
-
-    def __call__(self, poses: Poses) -> Array:
-        return self._compiled(poses.q, poses.force)[0][..., 0]
+    kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
+    model = replace(cell.model, effects=kept, observe="position")
+    tool = replace(cell.tool, markers={"tool": np.zeros(3)})
+    symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
+    arm, nominal = symbolic.arm, ca.DM([p.nominal for p in symbolic.parameters])
+    torque = ca.gradient(arm.potential, arm.q_commanded)
+    torque = ca.substitute(torque, symbolic.p, nominal)
+    compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"]], [torque])
+    return lambda poses: compiled(poses.q, poses.force)[0][..., 0]
 
 
 @dataclass(frozen=True)
@@ -330,7 +326,7 @@ def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
             f"{cell.source}: [workspace] torque_limits_Nm has {len(bound)} values, "
             f"but robot '{chain.name}' has {chain.n_joints} joints",
         )
-        torque = StaticTorque(cell, chain)
+        torque = static_torque(cell, chain)
         yield Bound(
             "torque", lambda p: np.abs(torque(p)), 0.0, np.array(bound), joints,
             "a torque_limits_Nm", ("N m",),

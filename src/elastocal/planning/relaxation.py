@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from elastocal.planning.criteria import (
 )
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-BATCH = 512  # candidates whose products are formed at once
 # Of the information of even weights, added to every plan's: none is singular, and the bound holds
 # all the same, since more information lowers Φ.
 RIDGE = 1e-9
@@ -51,25 +50,13 @@ class DesignProblem:
     source: str = ""
 
     @cached_property
-    def packed(self) -> Array:
-        """B_iᵀB_i as its upper triangle, √2 off the diagonal (N, p(p+1)/2), so that ⟨G, B_iᵀB_i⟩ is
-        a product of rows."""
-        rows, columns, factor = triangle(len(self.prior))
-        found = np.empty((len(self.blocks), len(rows)))
-        for k in range(0, len(found), BATCH):
-            A = self.matrices(np.arange(k, min(k + BATCH, len(found))))
-            found[k : k + BATCH] = A[:, rows, columns] * factor
-        return found
-
-    def matrices(self, chosen: IntArray) -> Array:
-        """B_iᵀB_i (k, p, p) of the candidates `chosen` (k,)."""
-        B = self.blocks[chosen]
-        return np.asarray(B.swapaxes(-1, -2) @ B)
+    def products(self) -> Array:
+        """B_iᵀB_i as rows (N, p²)."""
+        return np.asarray(self.blocks.swapaxes(-1, -2) @ self.blocks).reshape(len(self.blocks), -1)
 
     def prices(self, G: Array) -> Array:
         """d_i = tr(B_i G B_iᵀ) = −∂Φ/∂w_i (N,) for G (p, p)."""
-        rows, columns, factor = triangle(len(G))
-        return np.asarray(self.packed @ (G[rows, columns] * factor))
+        return np.asarray(self.products @ G.ravel())
 
     def information(self, chosen: IntArray) -> Array:
         """M (p, p) of the candidates `chosen` (k,)."""
@@ -78,10 +65,7 @@ class DesignProblem:
 
     def at(self, weights: Array) -> Array:
         """M (p, p) at weights w (N,)."""
-        rows, columns, factor = triangle(len(self.prior))
-        M = np.empty_like(self.prior)
-        M[rows, columns] = M[columns, rows] = weights @ self.packed / factor
-        return self.prior + M
+        return self.prior + (weights @ self.products).reshape(self.prior.shape)
 
     def even(self) -> Array:
         """w (N,): each group's share spread evenly."""
@@ -98,11 +82,6 @@ class DesignProblem:
 
     def restricted(self, kept: IntArray) -> DesignProblem:
         return replace(self, blocks=self.blocks[kept], group=self.group[kept])
-
-    def judged_by(self, criterion: ScenarioCriterion) -> DesignProblem:
-        other = replace(self, criterion=criterion)
-        other.__dict__["packed"] = self.packed
-        return other
 
     def balancing(self) -> Array:
         """T (p, p): parameters z, y = T z, whose information at even weights is 1.  Where base,
@@ -180,16 +159,9 @@ class DesignProblem:
         return np.sort(best_of(price, self.group, self.shares))
 
 
-@lru_cache
-def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
-    """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
-    rows, columns = np.triu_indices(p)
-    return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
-
-
-def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> float:
+def tangent_bound(problem: DesignProblem, tangent: TangentBound) -> float:
     """By max Σ w_i d_i over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l], d (N,) the prices."""
-    shares = problem.shares
+    shares, d = problem.shares, problem.prices(tangent.G)
     best = (np.sort(d[problem.group == g])[-shares[g] :].sum() for g in np.flatnonzero(shares))
     return tangent.bound(problem.prior, float(sum(best)))
 
@@ -220,9 +192,12 @@ class Relaxed:
 
 def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) -> Relaxed:
     """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l], of a `balanced`
-    problem of a certifiable criterion.  `start` (N,) ≥ 0: weights near the optimum, as those of a
-    smaller pool.  Where rounding forbids the `gap` that is asked for, the bound holds all the
-    same."""
+    problem.  `start` (N,) ≥ 0: weights near the optimum, as those of a smaller pool.  Where
+    rounding forbids the `gap` that is asked for, the bound holds all the same.  Of a criterion that
+    is not certifiable it is that of D over all parameters, which bounds nothing."""
+    if not problem.criterion.certifiable:
+        volume = replace(problem, criterion=DeterminantCriterion(np.eye(len(problem.prior))))
+        return replace(relax(volume, max(gap, 1e-3), start), bound=0.0)
     size = np.bincount(problem.group, minlength=len(problem.shares))
     full = (size == problem.shares)[problem.group]
     if full.any():
@@ -231,8 +206,9 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
     # Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379).
     weights, rounds = problem.even(), list[Relaxed]()
     weights = weights if start is None else EVEN * weights + (1 - EVEN) * start
-    soft = problem.judged_by(problem.criterion.softened(1.0))  # of a kink all sides count
-    weights = weights * np.sqrt(np.maximum(soft.worth(inverse(problem.at(weights)))[1], 0.0))
+    V = inverse(problem.at(weights))
+    _, C = problem.criterion.softened(1.0).slope(V)  # of a kink all sides count
+    weights = weights * np.sqrt(np.maximum(problem.prices(V @ C @ V), 0.0))
     least = problem.shares + 2  # of a group: as its share takes, and a choice
     sizes = np.where(
         problem.shares > 0,
@@ -244,7 +220,7 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
     for _ in range(MOST_ROUNDS):
         w, tangent, value = newton(problem.restricted(support), w, accuracy)
         d = problem.prices(tangent.G)
-        bound = tangent_bound(problem, tangent, d)
+        bound = tangent_bound(problem, tangent)
         weights = np.zeros(len(d))
         weights[support] = w
         rounds.append(Relaxed(weights, value, bound, tangent))
@@ -272,8 +248,7 @@ def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | 
     shares[np.unique(problem.group[fixed])] = 0
     if not shares.any():
         tangent = problem.criterion.tangent_at(inverse(prior))
-        bound = tangent_bound(problem, tangent, problem.prices(tangent.G))
-        return Relaxed(weights, tangent.value, bound, tangent)
+        return Relaxed(weights, tangent.value, tangent_bound(problem, tangent), tangent)
     rest = replace(problem.restricted(free), prior=prior, shares=shares)
     found = relax(rest, gap, None if start is None else start[free])
     weights[free] = found.weights
@@ -307,15 +282,13 @@ SHARPEST = 1e6  # order of a power mean beyond which rounding takes it for the m
 def newton(problem: DesignProblem, w: Array, accuracy: float) -> tuple[Array, TangentBound, float]:
     """Weights (k,) with log Φ within `accuracy` of the least, tangent, and Φ."""
     k = len(w)
-    A = problem.matrices(np.arange(k))
-    flat = A.reshape(k, -1)
     E = (problem.group == np.flatnonzero(problem.shares)[:, None]).astype(float)
     w, s, best = _inside(w, E, problem.shares[problem.shares > 0].astype(float)), None, None
     criterion = problem.criterion.softened(4.0)
     centred = SETTLED if problem.criterion.kinked else CENTRED
 
     def at(w: Array) -> tuple[Array, float, Array]:
-        V = inverse(problem.prior + (w @ flat).reshape(problem.prior.shape))
+        V = inverse(problem.at(w))
         return V, *criterion.slope(V)
 
     def merit(phi: float, w: Array, s: float) -> float:
@@ -325,7 +298,7 @@ def newton(problem: DesignProblem, w: Array, accuracy: float) -> tuple[Array, Ta
     for _ in range(MOST_STEPS):
         V, phi, _ = here
         tangent, value = criterion.tangent_at(V), float(problem.criterion.value(V))
-        gap = float(np.log(value / tangent_bound(problem, tangent, flat @ tangent.G.ravel())))
+        gap = float(np.log(value / tangent_bound(problem, tangent)))
         if best is None or gap < best[0]:
             best = gap, w, tangent, value
         if gap <= accuracy or (s is not None and s * 2 * k < 1e-2 * accuracy):
@@ -334,7 +307,7 @@ def newton(problem: DesignProblem, w: Array, accuracy: float) -> tuple[Array, Ta
             s = min(gap / (2 * k), 1.0)
             criterion = problem.criterion.softened(min(2 / gap + 4, SHARPEST))
             here = V, *criterion.slope(V)
-        step, slope = _step(criterion, A, here, w, s, E)
+        step, slope = _step(problem, criterion, here, w, s, E)
         low, high = float(np.min(step / w)), float(np.max(step / (1 - w)))
         t = min(1.0, TO_BOUNDARY / max(-low, 1e-9), TO_BOUNDARY / max(high, 1e-9))
         now, moved = merit(phi, w, s), None
@@ -355,12 +328,13 @@ def newton(problem: DesignProblem, w: Array, accuracy: float) -> tuple[Array, Ta
 
 
 def _step(
-    criterion: ScenarioCriterion, A: Array, here: tuple[Array, float, Array], w: Array, s: float,
-    E: Array,
+    problem: DesignProblem, criterion: ScenarioCriterion, here: tuple[Array, float, Array],
+    w: Array, s: float, E: Array,
 ) -> tuple[Array, float]:  # fmt: skip
-    (V, phi, C), k = here, len(A)
+    (V, phi, C), k = here, len(w)
+    A = problem.products.reshape(k, *V.shape)
     G, AV = V @ C @ V, A @ V
-    d = np.einsum("kij,ij->k", A, G) / phi
+    d = problem.prices(G) / phi
     AG = (A @ G).swapaxes(1, 2).reshape(k, -1)
     H = 2 / phi * AV.reshape(k, -1) @ AG.T - np.outer(d, d)
     bent = criterion.curvature(V, V @ AV)
@@ -442,15 +416,6 @@ def with_poses(V: Array, B: Array) -> Array:
     return np.asarray(V - BV.swapaxes(-1, -2) @ np.linalg.solve(K, BV))
 
 
-def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = None) -> Relaxed:
-    """The relaxation, whose weights begin plans and whose tangent prices candidates; of a criterion
-    that has none that of D over all parameters, which bounds nothing."""
-    if problem.criterion.certifiable:
-        return relax(problem, gap, start)
-    volume = DeterminantCriterion(np.eye(len(problem.prior)))
-    return replace(relax(problem.judged_by(volume), max(gap, 1e-3), start), bound=0.0)
-
-
 def exact_plan(
     problem: DesignProblem, relaxed: Relaxed, *, starts: int = 2, seed: int = 0,
     warm: IntArray | None = None,
@@ -466,7 +431,8 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
     """Exchanges on the softened criterion first, where Φ has kinks: what lowers a maximum is shut
     out wherever two of its arguments are equal and each exchange raises one of them."""
     if problem.criterion.kinked:
-        plan, _ = exchange(problem.judged_by(problem.criterion.softened(SOFT)), plan, LOOKS)
+        soft = replace(problem, criterion=problem.criterion.softened(SOFT))
+        plan, _ = exchange(soft, plan, LOOKS)
     return exchange(problem, plan, LOOKS)
 
 
@@ -480,7 +446,7 @@ def sized_plans(
         whole = problem_of(n)
         whole.check_enough()
         problem = whole.balanced()
-        relaxed = prospects(problem, start=weights)
+        relaxed = relax(problem, start=weights)
         chosen, _ = exact_plan(problem, relaxed, warm=chosen, seed=seed)
         value, weights = whole.value(chosen), relaxed.weights
         whole.check_determined(value)

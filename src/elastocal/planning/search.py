@@ -33,7 +33,7 @@ from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility, Roadmap, Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.poses import CHUNK, JointSpace, draw, points
-from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, prospects
+from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, relax
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -424,7 +424,7 @@ class Search:
     def select(self) -> Search:
         effort, seed = self.effort, self.seed
         self.progress(f"relaxation over {self.first} candidates")
-        self.relaxed = prospects(self.problem, CLOSE if effort.starts else FINE)
+        self.relaxed = relax(self.problem, CLOSE if effort.starts else FINE)
         best, ends = self._started()
         continuum = []
         for k in range(effort.rounds):
@@ -490,7 +490,7 @@ class Search:
     def _relax(self, gap: float = CLOSE) -> None:
         were = self.relaxed.weights
         start = np.concatenate([were, np.zeros(len(self.pool) - len(were))])
-        self.relaxed = prospects(self.problem, gap, start)
+        self.relaxed = relax(self.problem, gap, start)
 
     def _widened(self, k: int) -> State:
         asked = self.problem, self.relaxed.tangent, self.searches, self.T, self.pool, self.seed + k

@@ -58,7 +58,7 @@ from elastocal.planning.plan import (
     remaining_rms,
 )
 from elastocal.planning.poses import Candidates, TargetPoses, draw, known_rows, shares_of, sobol
-from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, prospects, relax
+from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, relax
 from elastocal.simulation import expand_plan, simulate
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -486,18 +486,30 @@ class Choice:
 
     def _moved(self, boxes: Boxes, point: RelaxedPoint) -> Array:
         """The places (k, 3) that lower Φ most at the weights of `point`, sought in units of the
-        boxes."""
+        boxes.  One model serves all of them: places on the tool are its parameters."""
         setup, pool, w = point.setup, point.pool, point.relaxed.weights
-        used = np.flatnonzero(w > USED * w.max())
-        there = _mobile(boxes, point.cell, setup.information)
+        used, information = np.flatnonzero(w > USED * w.max()), setup.information
+        here, on_tool = boxes.places(point.cell), [name != TRACKER for name in boxes.names]
+        motions: list[tuple[Entry, str]] = [
+            (LoadPointMotion(), LoadPointMotion.at)
+            if name == LOAD_POINT
+            else (MarkerMotion(), f"marker:{name}")
+            for name in boxes.names
+            if name != TRACKER
+        ]
+        mobile = Model.assembled(information.model.chain, point.cell, motions)
 
         def value(unit: Array) -> float:
-            B = there(boxes.at(unit)).blocks(pool.q[used], pool.readings[used])
+            model, places = copy(mobile), boxes.at(unit)
+            model.cell = boxes.placed(point.cell, places)  # of which the noise asks the tracker
+            x = np.concatenate([information.x, (places - here)[on_tool].ravel()])
+            there = replace(information, model=model, x=x)
+            B = there.blocks(pool.q[used], pool.readings[used])
             M = setup.gathered(B * np.sqrt(w[used])[:, None, None])
             return float(np.log(setup.criterion.of_information(M)))
 
         width = np.maximum(boxes.upper - boxes.lower, np.finfo(float).tiny)
-        unit = ((boxes.places(point.cell) - boxes.lower) / width).clip(0.0, 1.0).ravel()
+        unit = ((here - boxes.lower) / width).clip(0.0, 1.0).ravel()
         how = {"maxiter": 20, "eps": STEP, "ftol": 1e-4}
         limits = [(0.0, 1.0)] * len(unit)
         return boxes.at(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
@@ -524,34 +536,10 @@ class Choice:
             else:
                 setup, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
             pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
-            relaxed = prospects(setup.problem(pool, shares).balanced(), GAIN / 10)
+            relaxed = relax(setup.problem(pool, shares).balanced(), GAIN / 10)
         except InsufficientDataError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, tried.feasible / tried.tried)
-
-
-def _mobile(
-    boxes: Boxes, cell: Cell, information: PoseInformation
-) -> Callable[[Array], PoseInformation]:
-    """Information as at `cell`, of the same readings, with everything at other places (k, 3). One
-    model serves them all: places on the tool are its parameters."""
-    base, on_tool = boxes.places(cell), [n != TRACKER for n in boxes.names]
-    motions: list[tuple[Entry, str]] = [
-        (LoadPointMotion(), LoadPointMotion.at)
-        if name == LOAD_POINT
-        else (MarkerMotion(), f"marker:{name}")
-        for name, own in zip(boxes.names, on_tool, strict=True)
-        if own
-    ]
-    mobile = Model.assembled(information.model.chain, cell, motions)
-
-    def there(places: Array) -> PoseInformation:
-        model = copy(mobile)
-        model.cell = boxes.placed(cell, places)  # of which the noise asks the tracker
-        x = np.concatenate([information.x, (places - base)[on_tool].ravel()])
-        return replace(information, model=model, x=x)
-
-    return there
 
 
 def applied(chosen: Chosen, cell: Cell) -> Cell:
@@ -714,7 +702,7 @@ def chosen_states(
     def relaxed(ways: IntArray) -> tuple[float, Array]:
         own = replace(setup, ways=ways)
         problem = own.problem(own.pool(q[few], group[few]), shares).balanced()
-        weights = prospects(problem, GAIN / 3).weights
+        weights = relax(problem, GAIN / 3).weights
         value = float(problem.criterion.of_information(problem.at(weights)))
         return value, weights.reshape(len(ways), -1).sum(axis=1)
 

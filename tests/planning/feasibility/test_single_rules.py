@@ -28,7 +28,7 @@ from elastocal.cell import HalfSpace, HangingLoad, Visibility, Workspace
 from elastocal.cell_tables import EffectChoice, Tool, Tracker
 from elastocal.messages import InputError
 from elastocal.planning.collision import Kinematics
-from elastocal.planning.feasibility import Feasibility, StaticTorque
+from elastocal.planning.feasibility import Feasibility, static_torque
 
 EYE = Tracker(position=np.array([3.0, 0.0, 0.0]))
 MARKER = Tool(markers={"M1": np.zeros(3)})
@@ -90,7 +90,7 @@ def test_static_torque_is_pinocchios_gravity_and_the_transposed_jacobian(seed, t
     weighing = replace(weighing, model=replace(weighing.model, link_gravity=bool(chain.masses)))
     rng = np.random.default_rng(seed)
     q, force = rng.uniform(-2, 2, (20, chain.n_joints)), rng.normal(size=(20, 3)) * 500
-    found = StaticTorque(weighing, chain)(Kinematics(weighing, chain).poses(q, force))
+    found = static_torque(weighing, chain)(Kinematics(weighing, chain).poses(q, force))
     assert np.allclose(found, reference_torque(chain, tool.load_point, q, force), atol=1e-8)
     assert np.abs(found).max() > 10
 
@@ -137,10 +137,10 @@ def test_torque_limits_hold_in_both_directions_and_the_compensator_counts():
     plain = cell(limits, tool)
     nominal = replace(plain.model.nominal, gravity_compensator=spring)
     helped = replace(plain.model, effects=(EffectChoice("gravity_compensator"),), nominal=nominal)
-    torque = StaticTorque(replace(plain, model=helped), KR270_CHAIN)
+    torque = static_torque(replace(plain, model=helped), KR270_CHAIN)
     kinematics = Kinematics(plain, KR270_CHAIN)
     force = np.array([0, 0, -1000.0])
-    unhelped = StaticTorque(plain, KR270_CHAIN)(kinematics.poses(q, force))[0, 1]
+    unhelped = static_torque(plain, KR270_CHAIN)(kinematics.poses(q, force))[0, 1]
     s = np.hypot(0.7, 0.2)  # at q₂ = 0 the arm is square to the line of the anchors
     moment = 1e5 * (1 - 0.3 / s) * 0.7 * 0.2
     assert torque(kinematics.poses(q, force))[0, 1] - unhelped == pytest.approx(moment)
