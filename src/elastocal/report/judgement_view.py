@@ -63,7 +63,7 @@ def _doubt(f: Finding) -> str:
     return words.format(**{
         name: _length(f, name) if name.endswith("_um")
         else say.significant(value) if isinstance(value, float)
-        else listed(value) if isinstance(value, tuple) else value
+        else listed(map(str, value)) if isinstance(value, tuple) else value
         for name, value in f.numbers.items()
     })  # fmt: skip
 
