@@ -26,7 +26,7 @@ from elastocal.export.export import Wish, export
 from elastocal.export.robot_files import MujocoRest, urdf_flanges
 from elastocal.measurements import Measurements
 from elastocal.messages import ElastocalError
-from elastocal.model.chain import extent, finite_ranges, joint_limits
+from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.dh import read_dh
 from elastocal.model.rigid import nominal_flanges
 from elastocal.units import Array, rotation_from_rpy
@@ -105,7 +105,7 @@ def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
         losses[form] = done.cost.total.marker_max
     noise = model.cell.tracker.noise.sigma  # type: ignore[union-attr]
     return Trip(
-        name, model.chain.n_joints, extent(model.chain), float(np.linalg.norm(noise)),
+        name, model.chain.n_joints, sum(model.chain.lengths), float(np.linalg.norm(noise)),
         fit.nominal_rms, fit.test.rms, errors, losses,
     )  # fmt: skip
 
