@@ -284,11 +284,11 @@ def read_calibrated(
         stated = checked(_Result, {k: v for k, v in result.items() if v is not None}, result_path)
     except InputError as error:
         raise InputError(f"{error}; {ANEW}") from None
-    given = [entry.name for entry in stated.parameters]
-    for name in given:
-        told = f"{result_path}: parameter '{name}' is listed twice; {ANEW}"
-        require(given.count(name) == 1, told)
-    held = {entry.name: entry.held for entry in stated.parameters}
+    held: dict[str, float] = {}
+    for entry in stated.parameters:
+        told = f"{result_path}: parameter '{entry.name}' is listed twice; {ANEW}"
+        require(entry.name not in held, told)
+        held[entry.name] = entry.held
     # A cell that lists no markers took them from the table; their names stand in the parameters.
     places = (name.rpartition(".")[0] for name in held)
     markers = (place.removeprefix("marker:") for place in places if place.startswith("marker:"))
@@ -384,11 +384,8 @@ def _check_same(
 ) -> None:  # fmt: skip
     absent = [name for name in model.names if name not in held]
     surplus = [name for name in held if name not in set(model.names)]
-    told = [
-        f"{what} {', '.join(names[:4])}{' …' if len(names) > 4 else ''}"
-        for what, names in (("the result lacks", absent), ("the cell has no", surplus))
-        if names
-    ]
+    both = ("the result lacks", absent), ("the cell has no", surplus)
+    told = [f"{what} {listed(names, 4)}" for what, names in both if names]
     here, remedy = np.array(nominal_flange_rows(model.chain)), ""
     if not told and stated is not None:
         require(stated.shape == here.shape, f"{result}: nominal_flange takes 3 rows; {ANEW}")

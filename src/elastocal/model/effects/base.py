@@ -6,13 +6,12 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.above import later
 from elastocal.cell import Cell
 from elastocal.files import REGISTERED, check_registered
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
@@ -20,11 +19,6 @@ from elastocal.messages import InputError, listed, option, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, joint_index
 from elastocal.units import Array, pose_at
-
-if TYPE_CHECKING:
-    from elastocal.model.effects.smooth import SmoothFunction
-else:
-    globals().update(later("elastocal.model.effects.smooth SmoothFunction"))
 
 
 @dataclass(frozen=True)
@@ -396,8 +390,8 @@ class Effect:
         settings = self.settings(place, chain, cell)
         return {s.key: float(given.get(s.key, s.default or 0.0)) for s in settings}
 
-    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        """The smooth functions that its shrunk parameters at one place make up, if they do."""
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[Any, ...]:
+        """Each `SmoothFunction` that shrunk parameters at one place make up."""
         return ()
 
     def lasting(self, cell: Cell) -> Cell:

@@ -29,6 +29,7 @@ the force and moment of the load; all are `shrunk`.
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -166,6 +167,9 @@ class SmoothEffect(DrivenEffect):
     """u = Σ_c f_c(x_c) in every component of the motion at a place; `functions` says the f_c."""
 
     together = True
+
+    @abstractmethod
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]: ...
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         found: list[ParameterSpec] = []
