@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elastocal.messages import InputError
-from elastocal.model.evaluate import CHUNK, FEW, BatchFunction, chosen_backend
+from elastocal.model.evaluate import CHUNK, FEW, ONCE, BatchFunction, chosen_backend
 
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 
@@ -149,8 +149,11 @@ def test_few_rows_are_evaluated_by_casadi_as_by_numpy() -> None:
             np.testing.assert_array_equal(found, expected)
     few(MANY[:-1], ROWS[3])
     assert by_numpy(plain) and not by_numpy(few)
+    once = BatchFunction([PAIR, p], [sparse, PAIR + p], ONCE)
+    for found, expected in zip(once(MANY, ROWS[3]), plain(MANY, ROWS[3]), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-15)
     few(MANY, ROWS[3])
-    assert by_numpy(few)
+    assert by_numpy(few) and not by_numpy(once)
 
 
 # --- threads

@@ -45,7 +45,7 @@ from elastocal.model.effects.geometry import (
 )
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.model.effects.statics import JointCompliance
-from elastocal.model.evaluate import BatchFunction
+from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, rows_needed, subset
 from elastocal.units import Array, BoolArray
@@ -587,7 +587,7 @@ def compute_columns(
     whole = replace(cell, model=spec)
     extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
     key = "columns", spec.effects
-    full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra))
+    full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra, ONCE))
     at = dict(zip(base.model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
     observed = observe(table, full.observe)

@@ -134,10 +134,11 @@ def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -
 # evaluated by the same engine.
 
 BACKENDS = ("auto", "numpy")
+ONCE = "once"  # as "auto", of a function that is asked once: the program's own, no user's
 VARIABLE = "ELASTOCAL_BACKEND"
 # A row takes CasADi 4 ns per instruction and numpy 0.15, which pays 0.3 µs per instruction and
-# block beside (one core of a 2023 server).
-FEW = 77  # rows of a block
+# block beside (one core of a 2023 server), and 6 µs per instruction before the first one.
+FEW, FEW_ONCE = 77, 1500  # rows of a block
 
 
 def checked(name: str, source: str) -> str:
@@ -172,7 +173,8 @@ class BatchFunction:
     def __init__(
         self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
     ) -> None:
-        self._few = FEW * (chosen_backend(backend) == "auto")
+        by_casadi = chosen_backend(None if backend == ONCE else backend) == "auto"
+        self._most = (FEW_ONCE if backend == ONCE else FEW) * by_casadi  # rows of a block
         self._function = f = ca.Function("rows", list(inputs), list(outputs))
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
@@ -195,7 +197,7 @@ class BatchFunction:
             raise ValueError(f"inputs of shapes {shapes}; it takes {sizes} per row")
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
-        if n <= self._few * -(-n // max(chunk, 1)) and dtype == np.float64:
+        if n <= self._most * -(-n // max(chunk, 1)) and dtype == np.float64:
             # It takes rows side by side, and what is the same in all of them once.
             found = self._function.call([ca.DM(a.T if a.ndim == 2 else a) for a in arrays])
             for result, value in zip(results, found, strict=True):
