@@ -8,7 +8,7 @@ file of the user's own that calls `register`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Hashable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -147,6 +147,28 @@ def _check_known(key: str, what: str, found: str, valid: Collection[str], cell: 
 MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
+KEPT, FEW = 6, 20_000  # answers that are kept, of so many numbers: fits come back to half of them
+
+
+class Recent:
+    """The last answers to questions of few numbers; what a caller does to one changes no other."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Hashable, ...], tuple[NDArray, NDArray]] = {}
+
+    def __call__(
+        self, asked: Sequence[Hashable], given: Sequence[NDArray],
+        answer: Callable[[], tuple[NDArray, NDArray]],
+    ) -> tuple[NDArray, NDArray]:  # fmt: skip
+        if sum(x.size for x in given) > FEW:
+            return answer()
+        key = (*asked, *(x.tobytes() for x in given))
+        found = self._kept.get(key)
+        if found is None:
+            found = answer()
+            # Bound anew, not changed: threads may look it up at the same time.
+            self._kept = dict([*self._kept.items()][1 - KEPT :]) | {key: found}
+        return found[0].copy(), found[1].copy()
 
 
 class SymbolicArm:
@@ -196,6 +218,7 @@ class SymbolicArm:
             measured = rigid.rotation_from_vector(arm.input("rotation", 3))
             turned = rigid.vector_from_rotation(measured.T @ arm.reading["rotation"])
             self.reading = ca.vertcat(self.reading, turned)
+        self._recent = Recent()
         # Deflections by eq. (3), or by the equilibrium F(θ) = 0.
         self._linear = bool(arm.springs) and cell.model.deflection_model == "linear"
         self.implicit = bool(arm.springs) and not self._linear
@@ -240,12 +263,15 @@ class SymbolicArm:
         equilibrium with deflections below LARGEST counts: beyond that no arm is elastic any more.
         Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
         """
+        if self.implicit:
+            return self._recent((), [p, *inputs], lambda: self._of_visits(inputs, p))
         n, size = len(inputs[0]), len(self.arm.springs)
-        if not self.implicit:
-            return np.zeros((n, size), dtype=p.dtype), np.zeros((n, size, size))
-        # Once for rows one after the other that differ in nothing that bends the arm, as those of
-        # several markers do.
-        new = np.ones(n, dtype=bool)
+        return np.zeros((n, size), dtype=p.dtype), np.zeros((n, size, size))
+
+    def _of_visits(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+        """The same, once for rows one after the other that differ in nothing that bends the arm, as
+        those of several markers do."""
+        new = np.ones(len(inputs[0]), dtype=bool)
         felt = (a for a, acts in zip([*inputs, p], self._acting, strict=True) if acts)
         new[1:] = sum((a[1:] != a[:-1]).any(axis=1) for a in felt if a.ndim == 2) > 0
         at, begun = np.cumsum(new) - 1, np.flatnonzero(new)
@@ -327,6 +353,7 @@ class Total:
         self._arm, self._y, self._z = arm, arm.settled(y), z
         self._inputs = [*arm.arm.inputs.values(), *extra, arm.p, arm.arm.theta]
         self._functions: dict[tuple[int, ...], BatchFunction] = {}
+        self._recent = Recent()
 
     @cached_property
     def _derivative(self) -> tuple[ca.SX, ca.SX]:
@@ -355,18 +382,23 @@ class Total:
     ) -> tuple[Array, Array]:  # fmt: skip
         """y (n, m) and dy/dz (n, m, columns) of every row; y is NaN where there is no equilibrium.
         `columns` are those of z, by default all."""
-        function = self._function(tuple(range(self._z.shape[0])) if columns is None else columns)
-        given, (theta, F_theta) = [*inputs, *extra, x], self._arm.equilibrium(inputs, x)
-        if not self._arm.implicit:
-            y, slope = function(*given, theta)
+        asked = tuple(range(self._z.shape[0])) if columns is None else columns
+        arm, given = self._arm, [*inputs, *extra, x]
+
+        def evaluated() -> tuple[Array, Array]:
+            function, (theta, F_theta) = self._function(asked), arm.equilibrium(inputs, x)
+            if not arm.implicit:
+                y, slope = function(*given, theta)
+                return y[..., 0], slope
+            y_theta = self._slopes(*given, theta)[0]
+            y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
+            adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
+            adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
+            y, slope = function(*given, theta, adjoint)
+            y[~np.isfinite(theta).all(axis=1)] = np.nan
             return y[..., 0], slope
-        y_theta = self._slopes(*given, theta)[0]
-        y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
-        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
-        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        y, slope = function(*given, theta, adjoint)
-        y[~np.isfinite(theta).all(axis=1)] = np.nan
-        return y[..., 0], slope
+
+        return self._recent(asked, given, evaluated)
 
 
 # Fixed-point steps to the equilibrium.  Under 280 kg on a KR 270 they leave 2·10⁻⁴ of a column.
