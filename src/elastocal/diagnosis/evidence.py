@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
+from elastocal.diagnosis.hypotheses import ANY_SCALES, NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
@@ -256,6 +256,13 @@ class EntrySums:
             A -= Z.swapaxes(1, 2) @ Z
         return Spectrum.of(A, _later(moments, time, self.residuals[0].of)[..., None])
 
+    @cached_property
+    def _against(self) -> Array:
+        """P times the residuals along one motion of each configuration (C, T)."""
+        H = self.H.reshape(len(self.H), -1)
+        each = ((r.of.reshape(1, -1) * r.signs - r.h @ H).T for r in self.residuals)
+        return np.concatenate([*each], axis=1)
+
     def products(self, D: Array) -> tuple[Array, Array]:
         """A (V, k, k) and b (V, k, T) of the groups with directions D (C, v, d, V, k), or
         (C, 1, d, V, k) where they are the same in all visits of a configuration."""
@@ -269,7 +276,11 @@ class EntrySums:
         Z = self.H.reshape(-1, C * n) @ flat.reshape(C * n, V * k)
         A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
-        b = np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
+        b = (
+            flat.reshape(C, V * k).T @ self._against
+            if n == 1
+            else np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
+        )
         return A, b.reshape(V, k, -1)
 
 
@@ -359,6 +370,9 @@ class Item:
         return self.what.known
 
 
+LARGE = 5.0  # nats by which an effect has to be likelier where it may be of any size
+
+
 class Scan:
     """Everything scored under one `noise` beside the columns in `data`, where `something` is
     missing with this probability, and the odds of all together.
@@ -368,7 +382,8 @@ class Scan:
     the data there, √tr A, in standard deviations.  `odds` (1 + F,) is the log of the mean evidence
     over catalogue and blocks, weighted by prior, of the readings and of residuals whose
     configurations had their signs flipped, and `covariates` (1 + F,) the largest evidence among the
-    blocks of each; `marginal` the log marginal likelihood without them."""
+    blocks of each; `marginal` the log marginal likelihood without them.  `large` says whether an
+    effect that may be of any size is likelier to be far larger than usual."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
@@ -377,7 +392,7 @@ class Scan:
         prior = log_prior_odds(dataset.hypotheses, generic, something)
         grams = Grams(dataset, data, project(data, noise), flips)
         items, distance, rows = list[Item](), list[float](), list[Array]()
-        self.covariates: dict[str, Array] = {}
+        self.large, self.covariates = False, dict[str, Array]()
         whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
         for what, w in zip(whats, prior.tolist(), strict=True):
             grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
@@ -390,7 +405,11 @@ class Scan:
             spent = float(evidence[0] - own[k] + grid.log_prior[k])
             items.append(Item(what, grid.values[k], w + spent))
             distance.append(float(np.sqrt(spectra.lam[k].sum())))
-            if isinstance(what, Generic):
+            if isinstance(what, Hypothesis):
+                if what.effect.any_size:
+                    usual, any_size = (spectra.evidence(s).max() for s in (what.scales, ANY_SCALES))
+                    self.large |= bool(any_size > usual + LARGE)
+            else:
                 largest = self.covariates.get(what.covariate, evidence)
                 self.covariates[what.covariate] = np.maximum(largest, evidence)
         scores = prior[:, None] + np.array(rows)

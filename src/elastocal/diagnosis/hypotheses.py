@@ -10,13 +10,13 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-import scipy  # whose `optimize` loads where it is used
 from scipy.special import logsumexp
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
+from elastocal.engine import climb
 from elastocal.measurements import Measurements, by_rows, in_any_order
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
@@ -357,7 +357,7 @@ ROWS = 3000  # of the equations, as many as tell one start from another
 REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
-MOST_STEPS = 40  # of the refinement
+MOST_STEPS, STEP, ENOUGH = 40, 1e-7, 1e-8  # of the refinement, in widths of the starts and of χ²
 SAME = 0.05  # of χ²: a difference that is none
 
 
@@ -456,15 +456,17 @@ class StartSearch:
         def start_of(values: Array) -> dict[str, float]:
             return dict(zip(keys, map(float, x0 + width * values), strict=True))
 
-        def residual(values: Array) -> Array:
-            left, C = self._left([start_of(values)])
-            if left[0] >= self._unexplained @ self._unexplained:  # no amplitude that it can have
-                return np.append(self._unexplained / noise, values)
-            c = C[:, 0]
-            return np.append((self._unexplained - c * (c @ self._unexplained)) / noise, values)
+        def objective(values: Array) -> tuple[float, Array, Array]:
+            tried = values + np.vstack([np.zeros(len(keys)), STEP * np.eye(len(keys))])
+            left, C = self._left([start_of(each) for each in tried])
+            own = C * (left < self._unexplained @ self._unexplained)  # amplitudes that it can have
+            e = self._unexplained[:, None] - own * (self._unexplained @ own)
+            e = np.vstack([e / noise, tried.T])
+            J = (e[:, 1:] - e[:, :1]) / STEP
+            return float(e[:, 0] @ e[:, 0]), 2 * J.T @ e[:, 0], 2 * J.T @ J
 
-        found = scipy.optimize.least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS)
-        return start_of(found.x)
+        far = np.full(len(keys), np.inf)
+        return start_of(climb(objective, np.zeros(len(keys)), -far, far, ENOUGH, MOST_STEPS)[0])
 
     def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """The amplitude's (rows, size, starts), by the whole model at each start."""
