@@ -282,7 +282,7 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     # From both to the load alone.
     other = replace(dataset.base, model=with_keys(model, play_side=BY_LOAD))
     columns = replace(dataset.columns, base=other, rows=dataset.columns.rows.copy())
-    by_load = compute_columns(other, play)
+    by_load = compute_columns(other, play, entries=())
     for h in play:
         columns.rows[:, :, columns.places[h.key]] = by_load.of(h)
     # Of the fitted parameters none is of play: their columns are those they were.

@@ -12,13 +12,11 @@ import casadi as ca
 import numpy as np
 from scipy.special import logsumexp
 
-from elastocal.cell import Cell
 from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
 from elastocal.engine import climb
 from elastocal.measurements import Measurements, by_rows, in_any_order
-from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     Arm,
     BaseMotion,
@@ -363,7 +361,7 @@ SAME = 0.05  # of χ²: a difference that is none
 
 class StartSearch:
     """The starts of one hypothesis against the residual of the fitted arm, about x (K,) and B
-    (n_rows, size, K) of `full`.
+    (n_rows, size, K) of `full`, by its `model` without all that stands at nominal there.
 
     `part` are some of the observations, from the table's `rows`.  `X` (equations, parameters) are
     the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
@@ -372,8 +370,18 @@ class StartSearch:
     others have no columns without."""
 
     def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
-        self.full, self.h, self.base, self.x = full, h, base, x
-        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in full.parameters])
+        self.h, self.base = h, base
+        moved = zip(full.parameters, x, strict=True)
+        acting = {(p.effect, p.where) for p, v in moved if v != p.nominal} | {h.key}
+        known, spec = base.model.cell.model.effects, full.cell.model
+        effects = tuple(e for e in spec.effects if e in known or (e.name, e.where) in acting)
+        cell = replace(full.cell, model=replace(spec, effects=effects))
+        alone = made_once(
+            base.model, ("alone", effects), lambda: Model.assembled(full.chain, cell, (), ONCE)
+        )
+        at = dict(zip(full.names, x, strict=True))
+        self.model, self.x = alone, np.array([at[name] for name in alone.names])
+        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in alone.parameters])
         self.starts: tuple[dict[str, float], ...] = h.starts(base.model) or ({},)
         fitted, size = [full.names.index(name) for name in base.model.names], base.observed.size
         # What is only planned has no residual yet that a spring could answer for.
@@ -402,8 +410,8 @@ class StartSearch:
         for start in self.screened[0]:
             at, column = self._amplitude(start, table)
             at[own[0]] += self._fits(column[self.rows][:, :, None])[1][0]
-            observed = observe(table, self.full.observe)
-            columns = self.full.regressor(table, at, own, observed).B
+            observed = observe(table, self.model.observe)
+            columns = self.model.regressor(table, at, own, observed).B
             columns = columns.reshape(len(table), observed.size, -1)
             columns[:, :, 0] = column
             yield at[own], columns
@@ -413,9 +421,9 @@ class StartSearch:
         at = self.x.copy()
         at[self.own[0]] = self.h.parameters[0].nominal
         for key, value in start.items():
-            at[self.full.names.index(f"{self.h.where}.{key}")] = value
-        observed = observe(table, self.full.observe)
-        column = self.full.regressor(table, at, self.own[:1], observed).B
+            at[self.model.names.index(f"{self.h.where}.{key}")] = value
+        observed = observe(table, self.model.observe)
+        column = self.model.regressor(table, at, self.own[:1], observed).B
         return at, column.reshape(len(table), observed.size)
 
     @cached_property
@@ -569,8 +577,9 @@ class Columns:
 
 
 def compute_columns(
-    base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None
-) -> Columns:
+    base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None,
+    entries: Sequence[Entry] = ENTRIES,
+) -> Columns:  # fmt: skip
     """One evaluation of B of the fitted arm with every hypothesis and entry at zero.
 
     `found` are parameters of hypotheses that are not at zero, by name.
@@ -587,8 +596,8 @@ def compute_columns(
         deflection_model="linear",
     )
     whole = replace(cell, model=spec)
-    extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
-    key = "columns", spec.effects
+    extra = [(e, w) for e in entries for w in e.places(chain, cell)]
+    key = "columns", spec.effects, len(extra)
     full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra, ONCE))
     at = dict(zip(base.model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
@@ -611,29 +620,30 @@ def compute_columns(
 
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.  The base
-    stands as the cell says; so do the effect's settings where none is searched."""
+    of the `arm` stands as its cell says; so do the effect's settings where none is searched."""
 
-    def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
+    def __init__(self, hypothesis: Hypothesis, arm: Arm) -> None:
         effect, where = hypothesis.effect, hypothesis.where
         assert isinstance(effect, DrivenEffect)
-        self._arm = Arm(chain, cell)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        held = {} if searched else set_constants(effect, where, chain, cell)
-        u = effect.motion(self._arm, where, {**held, **fitted, **searched})
+        held = {} if searched else set_constants(effect, where, arm.chain, arm.cell)
+        u = effect.motion(arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
         # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,
         # all that the arm declared would be copied as many times.
-        declared = ca.vertcat(*self._arm.inputs.values())
+        felt = {name: x for name, x in arm.inputs.items() if ca.depends_on(D, x)}
+        declared = ca.vertcat(ca.SX.zeros(0, 1), *felt.values())
         used = [k for k in range(declared.numel()) if ca.depends_on(D, declared[k])]
-        self._used = np.array(used, dtype=np.int64)
+        self._arm, self._felt, self._used = arm, tuple(felt), np.array(used, dtype=np.int64)
         asked = ca.vertcat(ca.SX.zeros(0, 1), *(declared[k] for k in used))
         self._compiled = BatchFunction([asked, constants], [D])
 
     def asked(self, table: Measurements) -> Array:
         """What D depends on in each row of the table (n_rows, quantities)."""
-        return np.concatenate(row_inputs(self._arm, table), axis=1)[:, self._used]
+        felt = row_inputs(self._arm, table, self._felt)
+        return np.concatenate([np.zeros((len(table), 0)), *felt], axis=1)[:, self._used]
 
     def __call__(self, table: Measurements, settings: Array) -> Array:
         """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
