@@ -609,6 +609,8 @@ class Standardised:
 def beside(M: Array, z: Array, prior: Array, others: IntArray, own: slice) -> tuple[Array, Array]:
     """Of columns c what the others x, of prior precisions Λ, leave of normal matrix and right side:
     A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc and b = z_c − M_cx (M_xx + Λ)⁻¹ z_x."""
+    if not len(others):
+        return M[own, own], z[own]
     L = M[np.ix_(others, others)]
     L[np.diag_indices_from(L)] += prior[others]
     L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)

@@ -285,11 +285,9 @@ class EntrySums:
         Z = self.H.reshape(-1, C * n) @ flat.reshape(C * n, V * k)
         A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
-        b = (
-            flat.reshape(C, V * k).T @ self._against
-            if n == 1
-            else np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
-        )
+        if n == 1:
+            return A, (flat[:, 0].T @ self._against).reshape(V, k, -1)
+        b = np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
         return A, b.reshape(V, k, -1)
 
 

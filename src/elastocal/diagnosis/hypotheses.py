@@ -638,7 +638,7 @@ class RegressorDirection:
         used = [k for k in range(declared.numel()) if ca.depends_on(D, declared[k])]
         self._arm, self._felt, self._used = arm, tuple(felt), np.array(used, dtype=np.int64)
         asked = ca.vertcat(ca.SX.zeros(0, 1), *(declared[k] for k in used))
-        self._compiled = BatchFunction([asked, constants], [D])
+        self._compiled = BatchFunction([asked, constants], [D], ONCE)
 
     def asked(self, table: Measurements) -> Array:
         """What D depends on in each row of the table (n_rows, quantities)."""
