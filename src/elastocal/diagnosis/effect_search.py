@@ -275,7 +275,7 @@ ALIKE = 1e-3  # nats: the rounding of two fits must not choose between models th
 def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     """The data under the backlash model that its readings make likelier.  Where no side of approach
     is recorded, the cell has play already, or no reading tells the two apart, it stays as it is."""
-    model, noise = dataset.base.model, dataset.data.noise
+    model = dataset.base.model
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
@@ -287,21 +287,19 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
         columns.rows[:, :, columns.places[h.key]] = by_load.of(h)
     # Of the fitted parameters none is of play: their columns are those they were.
     under_other = replace(dataset, base=other, columns=columns)
-    here = _likeliest(dataset, noise)
-    there = _likeliest(under_other, noise, here.noise)
+    here = _likeliest(dataset, dataset.data.noise)
+    there = _likeliest(under_other, here.noise)
     if there.score > here.score + ALIKE:
         dataset, here, there = under_other, there, here
     d = gains(here.data, there.data, here.noise)
     return replace(dataset, other_backlash=doubt(float(d.sum()), d))
 
 
-def _likeliest(
-    dataset: DiagnosisData, noise: NoiseValues, start: NoiseValues | None = None
-) -> ModelSet:
+def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
     likeliest = max(play, key=lambda h: float(grams.of(h).evidence(h.scales).max()))
-    return ModelSet(dataset, (Item(likeliest, np.zeros(0), 0.0),), start or noise)
+    return ModelSet(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 
 
 def doubt(odds: float, d: Array) -> float:

@@ -373,15 +373,12 @@ class StartSearch:
         self.h, self.base = h, base
         moved = zip(full.parameters, x, strict=True)
         acting = {(p.effect, p.where) for p, v in moved if v != p.nominal} | {h.key}
-        known, spec = base.model.cell.model.effects, full.cell.model
-        effects = tuple(e for e in spec.effects if e in known or (e.name, e.where) in acting)
-        cell = replace(full.cell, model=replace(spec, effects=effects))
-        alone = made_once(
-            base.model, ("alone", effects), lambda: Model.assembled(full.chain, cell, (), ONCE)
-        )
+        known, every = base.model.cell.model.effects, full.cell.model.effects
+        effects = tuple(e for e in every if e in known or (e.name, e.where) in acting)
+        self.model = made_once(full, effects, lambda: full.with_effects(effects))
         at = dict(zip(full.names, x, strict=True))
-        self.model, self.x = alone, np.array([at[name] for name in alone.names])
-        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in alone.parameters])
+        self.x = np.array([at[name] for name in self.model.names])
+        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in self.model.parameters])
         self.starts: tuple[dict[str, float], ...] = h.starts(base.model) or ({},)
         fitted, size = [full.names.index(name) for name in base.model.names], base.observed.size
         # What is only planned has no residual yet that a spring could answer for.
