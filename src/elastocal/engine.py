@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -28,34 +29,12 @@ LOG_2PI = float(np.log(2 * np.pi))
 ROUNDING = 1e-12
 
 
-@dataclass(frozen=True)
-class Parts:
+class Parts(NamedTuple):
     """Parts K = ℓℓᵀ of every one of C clusters, with loadings ℓ (C, k, m, r); `of` (C, k) are the
     numbers of their variances."""
 
     of: IntArray
     loading: Array
-
-    @cached_property
-    def _wide(self) -> Array:
-        C, k, m, r = self.loading.shape
-        return np.ascontiguousarray(self.loading.swapaxes(1, 2)).reshape(C, m, k * r)
-
-    def add(self, V: Array, theta: Array) -> None:
-        """Σ θ K (C, m, m) onto V, θ (C, k)."""
-        own = self._wide * np.sqrt(theta).repeat(self.loading.shape[3], axis=1)[:, None]
-        V += own @ own.swapaxes(1, 2)
-
-    def times(self, u: Array) -> Array:
-        """K u (C, k, m)."""
-        moved = self._wide * (u[:, None] @ self._wide)
-        each = moved.reshape(*u.shape, -1, self.loading.shape[3]).sum(axis=3)
-        return np.asarray(each.swapaxes(1, 2))
-
-    def trace(self, P: Array) -> Array:
-        """tr P K (C, k)."""
-        each = np.einsum("cmk,cmk->ck", P @ self._wide, self._wide)
-        return np.asarray(each.reshape(len(P), -1, self.loading.shape[3]).sum(axis=2))
 
 
 @dataclass(frozen=True)
@@ -72,11 +51,41 @@ class Pack:
     def of(self) -> IntArray:
         return np.concatenate([part.of for part in self.parts], axis=1)
 
+    @cached_property
+    def _loadings(self) -> Array:
+        """Those of all parts beside each other (C, m, r₁ + r₂ + …)."""
+        each = (part.loading.swapaxes(1, 2).reshape(*self.e.shape, -1) for part in self.parts)
+        return np.concatenate([*each], axis=2)
+
+    @cached_property
+    def _widths(self) -> IntArray:
+        """r (k,) of each part."""
+        each = [np.full(part.of.shape[1], part.loading.shape[3]) for part in self.parts]
+        return np.concatenate(each)
+
+    def _by_part(self, values: Array) -> Array:
+        """Sums (C, …, k) over the columns (C, …, r₁ + r₂ + …) of each part."""
+        starts = np.cumsum(self._widths) - self._widths
+        return np.asarray(np.add.reduceat(values, starts, axis=-1))
+
+    def times(self, u: Array) -> Array:
+        """K u (C, k, m) of each part."""
+        return self._by_part(self._loadings * (u[:, None] @ self._loadings)).swapaxes(1, 2)
+
+    def trace(self, P: Array) -> Array:
+        """tr P K (C, k) of each part."""
+        return self._by_part(np.einsum("cmk,cmk->ck", P @ self._loadings, self._loadings))
+
+    @cached_property
+    def _sums(self) -> sparse.csr_array:
+        return sparse.csr_array((np.ones(self.of.size), (self.of.ravel(), np.arange(self.of.size))))
+
     def added(self, values: Array, K: int) -> Array:
         """Sums (K, …) of `values` (C, k, …) by the numbers of the variances."""
-        of, n = self.of, self.of.size
-        sums = sparse.csr_array((np.ones(n), (of.ravel(), np.arange(n))), shape=(K, n))
-        return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
+        out = np.zeros((K, *values.shape[2:]))
+        found = self._sums @ values.reshape(self.of.size, -1)
+        out[: len(found)] = found.reshape(-1, *values.shape[2:])
+        return out
 
     def pairs(self, values: Array, K: int) -> Array:
         """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
@@ -85,13 +94,26 @@ class Pack:
 
     def V(self, theta: Array) -> Array:
         """V (C, m, m) at θ (K,), absent rows of unit variance by themselves."""
-        V, here = np.zeros((*self.e.shape, self.e.shape[1])), ~self.absent
-        for part in self.parts:
-            part.add(V, theta[part.of])
-        if not here.all():
+        own = self._loadings * np.sqrt(theta[self.of]).repeat(self._widths, axis=1)[:, None]
+        V = own @ own.swapaxes(1, 2)
+        if self.absent.any():
+            here = ~self.absent
             V *= here[:, :, None] & here[:, None, :]
             np.einsum("cii->ci", V)[:] += self.absent
         return V
+
+
+SMALL = 8  # of triangles: below, LAPACK's general inverse is as fast
+
+
+def inverse_of_lower(L: Array) -> Array:
+    """L⁻¹ of lower triangles (C, m, m), by halves."""
+    if (m := L.shape[1]) <= SMALL:
+        return np.asarray(np.linalg.inv(L), dtype=np.float64)
+    out, k = np.zeros_like(L), m // 2
+    first, last = (inverse_of_lower(L[:, own, own]) for own in (slice(k), slice(k, m)))
+    out[:, :k, :k], out[:, k:, k:], out[:, k:, :k] = first, last, -last @ (L[:, k:, :k] @ first)
+    return out
 
 
 class Whitened:
@@ -101,7 +123,7 @@ class Whitened:
         self.pack = pack
         R = np.asarray(np.linalg.cholesky(pack.V(theta)), dtype=np.float64)
         self.log_det = 2 * float(np.log(np.einsum("cii->ci", R)).sum())
-        self.root = np.asarray(np.linalg.inv(R), dtype=np.float64)
+        self.root = inverse_of_lower(R)
         if pack.absent.any():
             self.root *= ~pack.absent[:, None, :]
         self.B = self.root @ pack.B
@@ -131,8 +153,9 @@ class State:
         """The packs with H = R⁻¹BL⁻ᵀ (C, m, p), so that P = R⁻ᵀ(1 − HHᵀ)R⁻¹, and R⁻¹(e − Bx)."""
         for w in self.packs:
             if p := w.B.shape[2]:
-                flat = w.B.reshape(-1, p)  # one product, not one for each cluster
-                yield w, (flat @ self.inverse.T).reshape(w.B.shape), w.e - w.B @ self.x
+                # One product, not one for each cluster.
+                H = linalg.blas.dtrmm(1.0, self.inverse, w.B.reshape(-1, p).T, lower=1).T
+                yield w, H.reshape(w.B.shape), w.e - w.B @ self.x
             else:
                 yield w, w.B, w.e
 
@@ -212,9 +235,8 @@ class Mixed:
         for w, H, z in state.each():
             pack, u, theta = w.pack, w.back(z[..., None])[..., 0], state.theta[w.pack.of]
             P = w.back((np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
-            trace = np.concatenate([part.trace(P) for part in pack.parts], axis=1)
-            Ku = np.concatenate([part.times(u) for part in pack.parts], axis=1)
-            slope += pack.added(theta * (trace - (Ku @ u[..., None])[..., 0]), K)
+            Ku = pack.times(u)
+            slope += pack.added(theta * (pack.trace(P) - (Ku @ u[..., None])[..., 0]), K)
             own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
             information += pack.pairs(own @ own.transpose(0, 2, 1), K)
             if H.shape[2]:
@@ -587,6 +609,8 @@ class Standardised:
 def beside(M: Array, z: Array, prior: Array, others: IntArray, own: slice) -> tuple[Array, Array]:
     """Of columns c what the others x, of prior precisions Λ, leave of normal matrix and right side:
     A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc and b = z_c − M_cx (M_xx + Λ)⁻¹ z_x."""
+    if not len(others):
+        return M[own, own], z[own]
     L = M[np.ix_(others, others)]
     L[np.diag_indices_from(L)] += prior[others]
     L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)

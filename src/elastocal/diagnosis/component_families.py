@@ -31,7 +31,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.identification.start import as_placed
 from elastocal.measurements import first_of_visit, with_moves
-from elastocal.model.effects.base import Effect, JointMotion, Stage, index, turning_joints
+from elastocal.model.effects.base import Arm, Effect, JointMotion, Stage, index, turning_joints
 from elastocal.model.effects.geometry import BY_ORDER, MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import (
     ApproachResponse,
@@ -492,7 +492,7 @@ def family_component(
     chain, cell = dataset.base.model.chain, dataset.base.model.cell
     cell = replace(cell, model=replace(cell.model, nominal=cell.model.nominal.at(where, settings)))
     lines = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
-    D = RegressorDirection(lines, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
+    D = RegressorDirection(lines, Arm(chain, cell))(dataset.table, np.zeros((1, 0)))[:, 0]
     D = D * [LINE * (p.typical or 0.0) for p in lines.parameters]
     columns = moved(dataset, (JointMotion.name, (where,)), D)
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))

@@ -31,7 +31,6 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of,
 from elastocal.diagnosis.effect_search import (
     MANY,
     ForwardSelection,
-    some_are_large,
     with_likelier_backlash_model,
 )
 from elastocal.diagnosis.hypotheses import (
@@ -264,7 +263,7 @@ def _diagnosed(
     dataset, found = few.before, few.selected
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
-    tests, answer = structure_tests(found.first), whole or few
+    tests, answer = structure_tests(found.blocks), whole or few
     answers = _pieces(answer, dataset, found.nothing.noise, tests, fields)
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
@@ -425,7 +424,7 @@ def _few_causes(
     """The answer by few causes, and suspects (N,) that stay.  What may be of any size is believed
     to be where it leaves next to nothing open, nor needs more."""
     usual = few, _ = _searched(dataset, options, progress)
-    if not some_are_large(few.before, few.selected.nothing):
+    if not few.selected.first.large:
         return usual
     wide = large, _ = _searched(few.before.of_any_size, options, progress)
     left, before = (answer.supported.unexplained for answer in (large, few))

@@ -30,7 +30,7 @@ from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit
 from elastocal.messages import InsufficientDataError
-from elastocal.model.effects.base import Setting, Stage
+from elastocal.model.effects.base import Arm, Setting, Stage
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.effects.statics import PayloadError
@@ -138,11 +138,11 @@ class DiagnosisData:
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
-        chain, cell = self.base.model.chain, as_placed(self.base.model, self.base.x)
+        arm = Arm(self.base.model.chain, as_placed(self.base.model, self.base.x))
         known, driven = self.columns.regressors, [h for h in self.hypotheses if h.driven]
         for h in driven:
             if h.key not in known:
-                known[h.key] = RegressorDirection(h, chain, cell)
+                known[h.key] = RegressorDirection(h, arm)
         return {h.key: known[h.key] for h in driven}
 
     @cached_property

@@ -28,7 +28,6 @@ from elastocal.diagnosis.baseline import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Grams, Item, Scan
 from elastocal.diagnosis.hypotheses import (
-    ANY_SCALES,
     NO_SETTINGS,
     Hypothesis,
     compute_columns,
@@ -275,19 +274,20 @@ ALIKE = 1e-3  # nats: the rounding of two fits must not choose between models th
 def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     """The data under the backlash model that its readings make likelier.  Where no side of approach
     is recorded, the cell has play already, or no reading tells the two apart, it stays as it is."""
-    model, noise = dataset.base.model, dataset.data.noise
+    model = dataset.base.model
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
     # From both to the load alone.
     other = replace(dataset.base, model=with_keys(model, play_side=BY_LOAD))
     columns = replace(dataset.columns, base=other, rows=dataset.columns.rows.copy())
-    by_load = compute_columns(other, play)
+    by_load = compute_columns(other, play, entries=())
     for h in play:
         columns.rows[:, :, columns.places[h.key]] = by_load.of(h)
     # Of the fitted parameters none is of play: their columns are those they were.
     under_other = replace(dataset, base=other, columns=columns)
-    here, there = (_likeliest(d, noise) for d in (dataset, under_other))
+    here = _likeliest(dataset, dataset.data.noise)
+    there = _likeliest(under_other, here.noise)
     if there.score > here.score + ALIKE:
         dataset, here, there = under_other, there, here
     d = gains(here.data, there.data, here.noise)
@@ -419,19 +419,6 @@ def about(
     )  # fmt: skip
 
 
-LARGE = 5.0  # nats by which an effect has to be likelier where it may be of any size
-
-
-def some_are_large(dataset: DiagnosisData, nothing: ModelSet) -> bool:
-    """Whether an effect that may be of any size is likelier to be far larger than usual."""
-    grams = Grams(dataset, nothing.data, nothing.at)
-    for h in (h for h in dataset.hypotheses if h.effect.any_size):
-        usual, large = (grams.of(h).evidence(s).max() for s in (h.scales, ANY_SCALES))
-        if large > usual + LARGE:
-            return True
-    return False
-
-
 FLIPS = 199
 CLOSE = 6  # candidates whose noise is fitted for themselves
 HOPELESS = -6.0  # score below which none is
@@ -467,8 +454,9 @@ class ForwardSelection:
     """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
     p-value of the first of them, or else of the likeliest addition, against all that chance could
     have found, which is to be below `level`.  The set was fitted on `dataset`: columns about a fit
-    with its large effects.  `first` is the scan beside nothing under its own noise, `alone` under
-    the final noise; `signs` (FLIPS, C) are the flips."""
+    with its large effects.  `first` is the scan beside nothing under its own noise, `blocks` with
+    flips and, where something was chosen, of the blocks alone; `alone` is that under the final
+    noise; `signs` (FLIPS, C) are the flips."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
@@ -477,7 +465,7 @@ class ForwardSelection:
         flips = FLIPS, len(dataset.blocks.member)
         self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)
-        first = alone = scanned = self._scan(nothing, beside=nothing)
+        first = alone = scanned = self._scan(nothing)
         slots, visited, p = list[Slot](), set[frozenset[int]](), None
         while True:
             best, slot = self._best_addition(current, scanned)
@@ -485,8 +473,7 @@ class ForwardSelection:
             if best is not None and slot.claimable_beside(current):
                 # Score all again under the noise beside the winner: an effect that is still missing
                 # looks like noise, and hides others with it.
-                if len(scanned.odds) == 1 or (best.noise.logs() != scanned.noise.logs()).any():
-                    observed = self._scan(current, best.noise, best)
+                observed = self._scan(current, best.noise, best)
                 if not current.items:
                     alone = observed
                 best, again = self._best_addition(current, observed)
@@ -515,10 +502,14 @@ class ForwardSelection:
         current, slots = self._paying(current, slots)
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
+        judged = replace(dataset, hypotheses=())
         if not current.items or p is None:
-            current, p = nothing, first.chance
-            self.dataset = dataset
-        self.chosen, self.slots, self.p_value = current, tuple(slots or [start]), p
+            current, p, self.dataset = nothing, None, dataset
+            judged = dataset
+        own = self.signs, nothing.at.scattered
+        self.blocks = Scan(judged, generic, SOMETHING, nothing.data, nothing.noise, own)
+        self.chosen, self.slots = current, tuple(slots or [start])
+        self.p_value = self.blocks.chance if p is None else p
         self.nothing, self.first, self.alone = nothing, first, alone
         self._fitted.clear()
 
@@ -529,16 +520,14 @@ class ForwardSelection:
         while current.items:
             noise = current.noise.of_instrument()
             together = left_out_together(self.dataset, current)
-            without = [
-                ModelSet(self.dataset, current.without(k), current.noise)
-                for k in range(len(current.items))
-            ]
             now = left_out_square(current.data, noise, together)
-            gains = [left_out_square(each.data, noise, together) - now for each in without]
+            without = (current.beside(k) for k in range(len(current.items)))
+            gains = [left_out_square(each, noise, together) - now for each in without]
             k = int(np.argmin(gains))
             if gains[k] > 0:
                 break
-            current, slots = without[k], slots[:k] + slots[k + 1 :]
+            current = ModelSet(self.dataset, current.without(k), current.noise)
+            del slots[k]
         return current, slots
 
     def _scan(

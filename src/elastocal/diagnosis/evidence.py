@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
+from elastocal.diagnosis.hypotheses import ANY_SCALES, NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
 
@@ -40,7 +40,7 @@ class Spectrum:
     @classmethod
     def of(cls, A: Array, b: Array) -> Spectrum:
         """Of Gram matrices A (V, K, K) and b (V, K, T)."""
-        lam, U = np.linalg.eigh(A)
+        lam, U = _eigen_of_pairs(A) if A.shape[1] == 2 else np.linalg.eigh(A)
         # Rounding leaves a tiny β along directions that P removes altogether.
         seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
         return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
@@ -54,6 +54,15 @@ class Spectrum:
         """Log evidence (V,) of the readings over the model without the group."""
         each = at_scales(self.lam, self.beta[..., :1], scales)[..., 0]
         return log_sum(each, axis=1) - np.log(len(scales))
+
+
+def _eigen_of_pairs(A: Array) -> tuple[Array, Array]:
+    """Eigenvalues (V, 2) and vectors (V, 2, 2) by the turn that makes A diagonal (Jacobi): LAPACK
+    would be called thousands of times."""
+    angle = 0.5 * np.arctan2(2 * A[:, 0, 1], A[:, 0, 0] - A[:, 1, 1])
+    c, s = np.cos(angle), np.sin(angle)
+    U = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
+    return (U * (A @ U)).sum(axis=1), U
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
@@ -255,6 +264,13 @@ class EntrySums:
             A -= Z.swapaxes(1, 2) @ Z
         return Spectrum.of(A, _later(moments, time, self.residuals[0].of)[..., None])
 
+    @cached_property
+    def _against(self) -> Array:
+        """P times the residuals along one motion of each configuration (C, T)."""
+        H = self.H.reshape(len(self.H), -1)
+        each = ((r.of.reshape(1, -1) * r.signs - r.h @ H).T for r in self.residuals)
+        return np.concatenate([*each], axis=1)
+
     def products(self, D: Array) -> tuple[Array, Array]:
         """A (V, k, k) and b (V, k, T) of the groups with directions D (C, v, d, V, k), or
         (C, 1, d, V, k) where they are the same in all visits of a configuration."""
@@ -268,6 +284,8 @@ class EntrySums:
         Z = self.H.reshape(-1, C * n) @ flat.reshape(C * n, V * k)
         A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
+        if n == 1:
+            return A, (flat[:, 0].T @ self._against).reshape(V, k, -1)
         b = np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
         return A, b.reshape(V, k, -1)
 
@@ -358,6 +376,9 @@ class Item:
         return self.what.known
 
 
+LARGE = 5.0  # nats by which an effect has to be likelier where it may be of any size
+
+
 class Scan:
     """Everything scored under one `noise` beside the columns in `data`, where `something` is
     missing with this probability, and the odds of all together.
@@ -367,7 +388,8 @@ class Scan:
     the data there, √tr A, in standard deviations.  `odds` (1 + F,) is the log of the mean evidence
     over catalogue and blocks, weighted by prior, of the readings and of residuals whose
     configurations had their signs flipped, and `covariates` (1 + F,) the largest evidence among the
-    blocks of each; `marginal` the log marginal likelihood without them."""
+    blocks of each; `marginal` the log marginal likelihood without them.  `large` says whether an
+    effect that may be of any size is likelier to be far larger than usual."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
@@ -376,7 +398,7 @@ class Scan:
         prior = log_prior_odds(dataset.hypotheses, generic, something)
         grams = Grams(dataset, data, project(data, noise), flips)
         items, distance, rows = list[Item](), list[float](), list[Array]()
-        self.covariates: dict[str, Array] = {}
+        self.large, self.covariates = False, dict[str, Array]()
         whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
         for what, w in zip(whats, prior.tolist(), strict=True):
             grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
@@ -389,7 +411,11 @@ class Scan:
             spent = float(evidence[0] - own[k] + grid.log_prior[k])
             items.append(Item(what, grid.values[k], w + spent))
             distance.append(float(np.sqrt(spectra.lam[k].sum())))
-            if isinstance(what, Generic):
+            if isinstance(what, Hypothesis):
+                if what.effect.any_size:
+                    usual, any_size = (spectra.evidence(s).max() for s in (what.scales, ANY_SCALES))
+                    self.large |= bool(any_size > usual + LARGE)
+            else:
                 largest = self.covariates.get(what.covariate, evidence)
                 self.covariates[what.covariate] = np.maximum(largest, evidence)
         scores = prior[:, None] + np.array(rows)

@@ -10,15 +10,13 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-import scipy  # whose `optimize` loads where it is used
 from scipy.special import logsumexp
 
-from elastocal.cell import Cell
 from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
+from elastocal.engine import climb
 from elastocal.measurements import Measurements, by_rows, in_any_order
-from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     Arm,
     BaseMotion,
@@ -357,13 +355,13 @@ ROWS = 3000  # of the equations, as many as tell one start from another
 REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
-MOST_STEPS = 40  # of the refinement
+MOST_STEPS, STEP, ENOUGH = 40, 1e-7, 1e-8  # of the refinement, in widths of the starts and of χ²
 SAME = 0.05  # of χ²: a difference that is none
 
 
 class StartSearch:
     """The starts of one hypothesis against the residual of the fitted arm, about x (K,) and B
-    (n_rows, size, K) of `full`.
+    (n_rows, size, K) of `full`, by its `model` without all that stands at nominal there.
 
     `part` are some of the observations, from the table's `rows`.  `X` (equations, parameters) are
     the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
@@ -372,8 +370,15 @@ class StartSearch:
     others have no columns without."""
 
     def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
-        self.full, self.h, self.base, self.x = full, h, base, x
-        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in full.parameters])
+        self.h, self.base = h, base
+        moved = zip(full.parameters, x, strict=True)
+        acting = {(p.effect, p.where) for p, v in moved if v != p.nominal} | {h.key}
+        known, every = base.model.cell.model.effects, full.cell.model.effects
+        effects = tuple(e for e in every if e in known or (e.name, e.where) in acting)
+        self.model = made_once(full, effects, lambda: full.with_effects(effects))
+        at = dict(zip(full.names, x, strict=True))
+        self.x = np.array([at[name] for name in self.model.names])
+        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in self.model.parameters])
         self.starts: tuple[dict[str, float], ...] = h.starts(base.model) or ({},)
         fitted, size = [full.names.index(name) for name in base.model.names], base.observed.size
         # What is only planned has no residual yet that a spring could answer for.
@@ -402,8 +407,8 @@ class StartSearch:
         for start in self.screened[0]:
             at, column = self._amplitude(start, table)
             at[own[0]] += self._fits(column[self.rows][:, :, None])[1][0]
-            observed = observe(table, self.full.observe)
-            columns = self.full.regressor(table, at, own, observed).B
+            observed = observe(table, self.model.observe)
+            columns = self.model.regressor(table, at, own, observed).B
             columns = columns.reshape(len(table), observed.size, -1)
             columns[:, :, 0] = column
             yield at[own], columns
@@ -413,9 +418,9 @@ class StartSearch:
         at = self.x.copy()
         at[self.own[0]] = self.h.parameters[0].nominal
         for key, value in start.items():
-            at[self.full.names.index(f"{self.h.where}.{key}")] = value
-        observed = observe(table, self.full.observe)
-        column = self.full.regressor(table, at, self.own[:1], observed).B
+            at[self.model.names.index(f"{self.h.where}.{key}")] = value
+        observed = observe(table, self.model.observe)
+        column = self.model.regressor(table, at, self.own[:1], observed).B
         return at, column.reshape(len(table), observed.size)
 
     @cached_property
@@ -456,15 +461,17 @@ class StartSearch:
         def start_of(values: Array) -> dict[str, float]:
             return dict(zip(keys, map(float, x0 + width * values), strict=True))
 
-        def residual(values: Array) -> Array:
-            left, C = self._left([start_of(values)])
-            if left[0] >= self._unexplained @ self._unexplained:  # no amplitude that it can have
-                return np.append(self._unexplained / noise, values)
-            c = C[:, 0]
-            return np.append((self._unexplained - c * (c @ self._unexplained)) / noise, values)
+        def objective(values: Array) -> tuple[float, Array, Array]:
+            tried = values + np.vstack([np.zeros(len(keys)), STEP * np.eye(len(keys))])
+            left, C = self._left([start_of(each) for each in tried])
+            own = C * (left < self._unexplained @ self._unexplained)  # amplitudes that it can have
+            e = self._unexplained[:, None] - own * (self._unexplained @ own)
+            e = np.vstack([e / noise, tried.T])
+            J = (e[:, 1:] - e[:, :1]) / STEP
+            return float(e[:, 0] @ e[:, 0]), 2 * J.T @ e[:, 0], 2 * J.T @ J
 
-        found = scipy.optimize.least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS)
-        return start_of(found.x)
+        far = np.full(len(keys), np.inf)
+        return start_of(climb(objective, np.zeros(len(keys)), -far, far, ENOUGH, MOST_STEPS)[0])
 
     def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """The amplitude's (rows, size, starts), by the whole model at each start."""
@@ -567,8 +574,9 @@ class Columns:
 
 
 def compute_columns(
-    base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None
-) -> Columns:
+    base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None,
+    entries: Sequence[Entry] = ENTRIES,
+) -> Columns:  # fmt: skip
     """One evaluation of B of the fitted arm with every hypothesis and entry at zero.
 
     `found` are parameters of hypotheses that are not at zero, by name.
@@ -585,8 +593,8 @@ def compute_columns(
         deflection_model="linear",
     )
     whole = replace(cell, model=spec)
-    extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
-    key = "columns", spec.effects
+    extra = [(e, w) for e in entries for w in e.places(chain, cell)]
+    key = "columns", spec.effects, len(extra)
     full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra, ONCE))
     at = dict(zip(base.model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
@@ -609,29 +617,30 @@ def compute_columns(
 
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.  The base
-    stands as the cell says; so do the effect's settings where none is searched."""
+    of the `arm` stands as its cell says; so do the effect's settings where none is searched."""
 
-    def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
+    def __init__(self, hypothesis: Hypothesis, arm: Arm) -> None:
         effect, where = hypothesis.effect, hypothesis.where
         assert isinstance(effect, DrivenEffect)
-        self._arm = Arm(chain, cell)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        held = {} if searched else set_constants(effect, where, chain, cell)
-        u = effect.motion(self._arm, where, {**held, **fitted, **searched})
+        held = {} if searched else set_constants(effect, where, arm.chain, arm.cell)
+        u = effect.motion(arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
         # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,
         # all that the arm declared would be copied as many times.
-        declared = ca.vertcat(*self._arm.inputs.values())
+        felt = {name: x for name, x in arm.inputs.items() if ca.depends_on(D, x)}
+        declared = ca.vertcat(ca.SX.zeros(0, 1), *felt.values())
         used = [k for k in range(declared.numel()) if ca.depends_on(D, declared[k])]
-        self._used = np.array(used, dtype=np.int64)
+        self._arm, self._felt, self._used = arm, tuple(felt), np.array(used, dtype=np.int64)
         asked = ca.vertcat(ca.SX.zeros(0, 1), *(declared[k] for k in used))
-        self._compiled = BatchFunction([asked, constants], [D])
+        self._compiled = BatchFunction([asked, constants], [D], ONCE)
 
     def asked(self, table: Measurements) -> Array:
         """What D depends on in each row of the table (n_rows, quantities)."""
-        return np.concatenate(row_inputs(self._arm, table), axis=1)[:, self._used]
+        felt = row_inputs(self._arm, table, self._felt)
+        return np.concatenate([np.zeros((len(table), 0)), *felt], axis=1)[:, self._used]
 
     def __call__(self, table: Measurements, settings: Array) -> Array:
         """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""

@@ -8,10 +8,8 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-import scipy  # whose `ndimage` loads where it is used
+import scipy  # whose `ndimage` and `sparse.csgraph` load where they are used
 from scipy import linalg, sparse, special
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.baseline import (
     JOINT_SPREAD,
@@ -41,6 +39,7 @@ from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_o
 from elastocal.measurements import numbered, rounded_joints
 from elastocal.messages import ElastocalError
 from elastocal.model.effects.geometry import BaseFrame
+from elastocal.model.evaluate import row_blocks
 from elastocal.model.observations import pure_error, subset
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -79,6 +78,7 @@ def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int
 NEAR = 5e-3  # rad, or m
 SOON = 0.1  # share of the campaign within which two visits follow each other soon
 ENOUGH_PAIRS = 8  # that are stated by themselves
+DISTANCES = 2**16  # between points that are looked at together
 
 
 def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> NearRepeats | None:
@@ -101,7 +101,7 @@ def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Nea
     known, at_ends = np.unique(pairs, return_inverse=True)
     n, ends = len(known), at_ends.reshape(pairs.shape).T
     links = sparse.csr_array((np.ones(len(pairs)), tuple(ends)), (n, n))
-    independent = n - int(connected_components(links)[0])
+    independent = n - int(sparse.csgraph.connected_components(links)[0])
     of_all = float(np.sqrt(squares.mean()))
     return NearRepeats(of_all, len(pairs), independent, scatter(~apart), scatter(apart))
 
@@ -115,17 +115,22 @@ def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
     same, some = np.column_stack([table.configuration[lead], kind]), np.flatnonzero(good)
     some = some[np.unique(same[some], axis=0, return_index=True)[1]]
     # Of another marker or load no reading is near.
-    pairs, distance = nearest(np.column_stack([table.q[lead[some]], kind[some]]), np.inf)
-    return _unordered(some[pairs[distance <= NEAR]])
+    of_kind = [some[kind[some] == k] for k in np.unique(kind[some])]
+    near = [mine[nearest(table.q[lead[mine]], np.inf, NEAR)] for mine in of_kind]
+    return _unordered(np.concatenate([np.zeros((0, 2), dtype=np.int64), *near]))
 
 
-def nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
-    """Each of the points x (n, d) beside the nearest other one (n, 2), and how far that is (n,)."""
-    distance, near = cKDTree(x).query(x, k=2, p=norm)
-    own = np.arange(len(x))
-    # Of a point that stands there twice, either one may come first.
-    other = (near[:, 0] == own).astype(int)
-    return np.column_stack([own, near[own, other]]), distance[own, other]
+def nearest(x: Array, norm: float = 2.0, within: float = np.inf) -> IntArray:
+    """Points of x (n, d) beside the nearest other one (k, 2), where that is `within` a distance.
+    By all distances: what finds neighbours among millions takes longer to load."""
+    pairs = [np.zeros((0, 2), dtype=np.int64)]
+    for block in row_blocks(len(x), DISTANCES // len(x)):
+        own = np.arange(block.start, block.stop)
+        apart = np.linalg.norm(x[own, None] - x, norm, axis=2)
+        apart[own - block.start, own] = np.inf
+        near = apart.min(axis=1) <= within
+        pairs.append(np.column_stack([own, apart.argmin(axis=1)])[near])
+    return np.concatenate(pairs)
 
 
 def _unordered(pairs: IntArray) -> IntArray:
@@ -163,7 +168,7 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
         z = a[known, j] / np.sqrt(h[known, j])
         pairs = [*(_next_to(q[known, k]) for k in range(J)), _next_to(moment[known])]
         scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
-        one, other = _unordered(nearest(scaled)[0]).T
+        one, other = _unordered(nearest(scaled)).T
         pairs.append((one, other))
         rho = np.array([(z[i] * z[k]).mean() for i, k in pairs])
         rho /= max(float((z**2).mean()), 1e-300)

@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain as chain_of
 from itertools import combinations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy  # whose `spatial` loads where rotations were read
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import Convention, ModelSpec, Tool
@@ -52,6 +53,9 @@ from elastocal.model.manipulator import Model, load_chain
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.units import Array, IntArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 # What an alternative must bring the error down by.  Of 8 readings it is a likelihood ratio of 38
 # nats, against 8 for the choice among all the alternatives.
@@ -141,7 +145,7 @@ def _of_robots(cell: Cell, table: Measurements) -> Iterator[tuple[Model, str, Me
 def _of_frames(table: Measurements) -> Iterator[Alternative]:
     if table.rotation is None:
         return
-    turn = Rotation.from_rotvec(np.asarray(table.rotation)).inv()
+    turn = scipy.spatial.transform.Rotation.from_rotvec(np.asarray(table.rotation)).inv()
     told = "turned round, from poses of the tracker in the target's axes to those of the target in "
     told += "the tracker's, they would fit to {}"
     yield told, replace(table, position=-turn.apply(table.position), rotation=turn.as_rotvec())
@@ -172,6 +176,7 @@ EULER = {"xyz": "the fixed x, y and z", "XYZ": "the moving x, y and z",
 
 def _meant(raw: Array) -> Iterator[tuple[str, Rotation]]:
     """Rotation vectors `raw` (n, 3) as they may be meant, after words that say how."""
+    Rotation = scipy.spatial.transform.Rotation
     x, y, z, w = (read := Rotation.from_rotvec(raw)).as_quat().T
     other = Rotation.from_quat(np.column_stack([w, x, y, z]))
     yield "qw, qx, qy, qz hold x, y, z, w", other
@@ -197,6 +202,7 @@ def rotations_off(model: Model, table: Measurements, of: str, turned: Array | No
         return ""
     table = _some(table)
     found, flange = Registration.of(model, table), model.rigid.flange_poses(table)
+    Rotation = scipy.spatial.transform.Rotation
     arm, raw = Rotation.from_matrix(found.rotation @ flange[:, :3, :3]), np.asarray(table.rotation)
     off, read = partial(_turned, arm, marker=table.marker), Rotation.from_rotvec(raw)
     angle = float(np.median(off(read) if turned is None else turned))

@@ -564,7 +564,7 @@ def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None
     default it is at first the whole misfit at the start."""
     free, sizes = problem.free, problem.sizes
     if sigma is None:
-        misfit = problem.weights.apply(problem.residual(problem.x0))
+        misfit = problem.weights.apply(problem.evaluate(problem.x0, free)[0])
         sigma = max(float(np.sqrt(np.mean(misfit**2))), 1e-12)
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from typing import Literal, get_args
 
+import casadi as ca
 import numpy as np
-import scipy  # whose `optimize` loads where it is used: it takes as long as a small fit
+import scipy  # whose `optimize` and `spatial` load where they are used, as long as a small fit
 from scipy import special
-from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell
 from elastocal.identification.knowledge import Constraints, GaussianPrior
@@ -32,6 +32,7 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.geometry import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
+from elastocal.model.rigid import rotation_from_vector, vector_from_rotation
 from elastocal.units import Array, BoolArray, IntArray
 
 IntervalKind = Literal[
@@ -188,6 +189,13 @@ SETTLED = 1e-6  # change of the median distance, relative, with which the sweeps
 RCOND = 1e-6  # a direction the poses do not show stays at zero instead of running away
 
 
+# Rotations (24, 3, 3) that turn a cube into itself.
+QUARTER_TURNS = [
+    turn for axes in permutations(np.eye(3)) for sides in product((1.0, -1.0), repeat=3)
+    if np.linalg.det(turn := np.array(axes) * sides) > 0
+]  # fmt: skip
+
+
 class Registration:
     """R_b, t_b, m with p_i = R_b (R_i m_c(i) + t_i) + t_b by robust alternating registration from
     several starts; the best by median distance wins: T_tracker_base as rotation (3, 3) and
@@ -217,7 +225,7 @@ class Registration:
             rotation = np.stack([
                 U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt,
                 _rotation_between(self._body(markers), points, np.ones(len(points))),
-                *Rotation.create_group("O").as_matrix(),
+                *QUARTER_TURNS,
             ])  # fmt: skip
         else:
             rotation = base[0][None]
@@ -335,10 +343,11 @@ def start_values(
     )  # fmt: skip
     values = {
         "base.": [*found.translation],
-        "base.r": Rotation.from_matrix(found.rotation).as_rotvec(),
+        "base.r": ca.evalf(vector_from_rotation(found.rotation)).elements(),
     }
     values |= {f"marker:{name}.": at for name, at in zip(names, found.markers, strict=True)}
     if model.observe == "pose" and table.rotation is not None:
+        Rotation = scipy.spatial.transform.Rotation
         arm = Rotation.from_matrix(found.rotation @ flange[:, :3, :3])
         relative = arm.inv() * Rotation.from_rotvec(table.rotation)
         values |= {f"marker:{names[c]}.r": relative[codes == c].mean().as_rotvec()
@@ -695,7 +704,7 @@ def as_placed(model: Model, x: Array) -> Cell:
               if p.effect == BaseFrame.name and p.unit == "rad"]  # fmt: skip
     if len(vector) != 3:
         return model.cell
-    turned = Rotation.from_rotvec(vector).as_matrix()
+    turned = ca.evalf(rotation_from_vector(vector)).full()
     nominal = replace(model.cell.model.nominal, base_rotation=turned)
     return replace(model.cell, model=replace(model.cell.model, nominal=nominal))
 
@@ -729,6 +738,7 @@ class Fallen:
         """The table in that frame; forces stay, which are down by the cell's own word."""
         R, rotation, sigma = self.turn, table.rotation, table.sigma
         if rotation is not None:
+            Rotation = scipy.spatial.transform.Rotation
             rotation = (Rotation.from_matrix(R) * Rotation.from_rotvec(rotation)).as_rotvec()
         if sigma is not None and table.sigma_frame == "cartesian":
             sigma = sigma @ np.abs(R).T

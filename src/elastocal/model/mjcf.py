@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.linalg import null_space
-from scipy.spatial.transform import Rotation
+import scipy  # whose `spatial` loads where it is used
 
 from elastocal.files import check_size
 from elastocal.messages import InputError, listed, printable, quoted, require
@@ -153,6 +152,7 @@ class MjcfArm:
         # The shortest turn; about x where the file stands on its head.
         turn = np.diag([1.0, -1.0, -1.0])
         if np.abs(up[:2]).max() > 1e-9:
+            Rotation = scipy.spatial.transform.Rotation
             turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()
         return turn, f"of body '{self.base}', up against the file's gravity"
 
@@ -195,7 +195,8 @@ class MjcfArm:
         J, which = data.efc_J.reshape(-1, model.nv)[rows], data.efc_id[rows]
         springs = [j for j in range(model.njnt) if is_spring(model, j)]
         others = np.delete(J, [*own, *model.jnt_dofadr[springs]], axis=1)
-        N = null_space(np.hstack([others, np.zeros((len(J), 1))]).T).T if len(J) else J[:0, :0]
+        beside = np.hstack([others, np.zeros((len(J), 1))])
+        N = scipy.linalg.null_space(beside.T).T if len(J) else J[:0, :0]
         left = N @ J[:, own] if len(J) else np.zeros((0, len(own)))
         if np.abs(left).max(initial=0.0) < BOUND:
             return
@@ -305,7 +306,8 @@ def before(model: Any, j: int) -> Array:
 
 def transform(position: Sequence[float] | Array, quaternion: Sequence[float] | Array) -> Array:
     """(4, 4) of a position (3,) in m and a quaternion (w, x, y, z)."""
-    return pose_at(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
+    turn = scipy.spatial.transform.Rotation.from_quat(quaternion, scalar_first=True)
+    return pose_at(position, turn.as_matrix())
 
 
 def import_mujoco(what: str = "a MuJoCo model") -> Any:

@@ -18,7 +18,6 @@ from functools import cached_property, reduce
 from itertools import takewhile
 from pathlib import Path
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
@@ -168,6 +167,8 @@ class XmlFile:
 
 
 def element(tag: str, stated: Mapping[str, str], *inside: str) -> str:
+    from xml.sax.saxutils import quoteattr  # loads the modules of the internet, for a file written
+
     head = f"<{tag}{''.join(f' {k}={quoteattr(v)}' for k, v in stated.items())}"
     return f"{head}>{''.join(inside)}</{tag}>" if inside else f"{head}/>"
 

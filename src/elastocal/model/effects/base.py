@@ -4,7 +4,7 @@ chain, its expression, its traits."""
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -205,12 +205,13 @@ COLUMNS = {
 LEVEL_TOLERANCE = 0.01
 
 
-def row_inputs(arm: Arm, table: Measurements) -> list[NDArray]:
-    """One (n, size) array per input the arm declared, in its order."""
+def row_inputs(arm: Arm, table: Measurements, asked: Iterable[str] | None = None) -> list[NDArray]:
+    """One (n, size) array for each input that is asked for, by default all that the arm declared,
+    in its order."""
     strange = {table.marker_names[k] for k in np.unique(table.marker)} - set(arm.markers)
     told = f"marker '{min(strange, default='')}' is not one of the cell's markers:"
     require(not strange, f"{table.source}: {told} {', '.join(arm.markers)}")
-    return [_one(arm, table, name) for name in arm.inputs]
+    return [_one(arm, table, name) for name in (arm.inputs if asked is None else asked)]
 
 
 def _one(arm: Arm, table: Measurements, name: str) -> NDArray:

@@ -57,7 +57,7 @@ from elastocal.model.effects.base import (
 )
 from elastocal.model.effects.geometry import BY_ORDER, JUMP_TIME, KEYS, Jump, came_from, magnitude
 from elastocal.model.effects.statics import LoadedEffect, TorqueEffect, add_deflection
-from elastocal.model.evaluate import BatchFunction
+from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.units import Array
 
 # Waves up to this many times 1/ℓ: what is beyond has 0.2 % of the variance.
@@ -123,7 +123,7 @@ class Waves:
     def at(self, x: Array) -> Array:
         """The same numbers (n, count) at x (n,)."""
         symbol = ca.SX.sym("x")
-        waves = BatchFunction([symbol], [ca.vertcat(*self.values(symbol))])
+        waves = BatchFunction([symbol], [ca.vertcat(*self.values(symbol))], ONCE)
         return np.asarray(waves(x[:, None])[0][..., 0])
 
 

@@ -33,7 +33,7 @@ from elastocal.model.effects.base import (
     transverse_axes,
     turning_joints,
 )
-from elastocal.model.evaluate import BatchFunction
+from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.units import Array
 
 
@@ -310,7 +310,7 @@ def _levers_at(chain: Chain, j: int) -> Array:
     """`levers` of joint j in random poses (POSES, functions, 3)."""
     q = ca.SX.sym("q", chain.n_joints)
     at = rigid.drawn_joints(chain)[2][:POSES]
-    return np.asarray(BatchFunction([q], [levers(chain, q, j)])(at)[0])
+    return np.asarray(BatchFunction([q], [levers(chain, q, j)], ONCE)(at)[0])
 
 
 def _sizes(chain: Chain, j: int) -> dict[int, float]:
