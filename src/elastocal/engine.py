@@ -103,19 +103,6 @@ class Pack:
         return V
 
 
-SMALL = 8  # of triangles: below, LAPACK's general inverse is as fast
-
-
-def inverse_of_lower(L: Array) -> Array:
-    """L⁻¹ of lower triangles (C, m, m), by halves."""
-    if (m := L.shape[1]) <= SMALL:
-        return np.asarray(np.linalg.inv(L), dtype=np.float64)
-    out, k = np.zeros_like(L), m // 2
-    first, last = (inverse_of_lower(L[:, own, own]) for own in (slice(k), slice(k, m)))
-    out[:, :k, :k], out[:, k:, k:], out[:, k:, :k] = first, last, -last @ (L[:, k:, :k] @ first)
-    return out
-
-
 class Whitened:
     """A pack under V = RRᵀ: `root` R⁻¹ (C, m, m), R⁻¹B and R⁻¹e, zeros in absent rows, log|V|."""
 
@@ -123,7 +110,7 @@ class Whitened:
         self.pack = pack
         R = np.asarray(np.linalg.cholesky(pack.V(theta)), dtype=np.float64)
         self.log_det = 2 * float(np.log(np.einsum("cii->ci", R)).sum())
-        self.root = inverse_of_lower(R)
+        self.root = np.asarray(np.linalg.inv(R), dtype=np.float64)
         if pack.absent.any():
             self.root *= ~pack.absent[:, None, :]
         self.B = self.root @ pack.B

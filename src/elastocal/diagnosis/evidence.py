@@ -40,7 +40,7 @@ class Spectrum:
     @classmethod
     def of(cls, A: Array, b: Array) -> Spectrum:
         """Of Gram matrices A (V, K, K) and b (V, K, T)."""
-        lam, U = _eigen_of_pairs(A) if A.shape[1] == 2 else np.linalg.eigh(A)
+        lam, U = np.linalg.eigh(A)
         # Rounding leaves a tiny β along directions that P removes altogether.
         seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
         return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
@@ -54,15 +54,6 @@ class Spectrum:
         """Log evidence (V,) of the readings over the model without the group."""
         each = at_scales(self.lam, self.beta[..., :1], scales)[..., 0]
         return log_sum(each, axis=1) - np.log(len(scales))
-
-
-def _eigen_of_pairs(A: Array) -> tuple[Array, Array]:
-    """Eigenvalues (V, 2) and vectors (V, 2, 2) by the turn that makes A diagonal (Jacobi): LAPACK
-    would be called thousands of times."""
-    angle = 0.5 * np.arctan2(2 * A[:, 0, 1], A[:, 0, 0] - A[:, 1, 1])
-    c, s = np.cos(angle), np.sin(angle)
-    U = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
-    return (U * (A @ U)).sum(axis=1), U
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,

@@ -181,20 +181,11 @@ def same_size(codes: NDArray[np.integer]) -> Iterator[IntArray]:
         yield order[starts[counts == count][:, None] + np.arange(count)]
 
 
-def connected(links: sparse.csr_array) -> IntArray:
-    """The first of the rows (n,) that each is linked with, by a symmetric matrix with a diagonal;
-    `sparse.csgraph` takes longer to load."""
-    first, before = np.arange(links.shape[0]), np.zeros(0)
-    while not np.array_equal(first, before):
-        before, first = first, np.minimum.reduceat(first[links.indices], links.indptr[:-1])
-        first = first[first]
-    return first
-
-
 def whitener(covariance: sparse.csr_array) -> sparse.csr_array:
     """L⁻¹ of the Cholesky factor, block by block over groups of correlated rows."""
+    _, label = sparse.csgraph.connected_components(covariance, directed=False)
     rows, columns, values = [], [], []
-    for members in same_size(connected(covariance)):
+    for members in same_size(label):
         size = members.shape[1]
         i, j = members[:, :, None], members[:, None, :]
         i, j = np.broadcast_arrays(i, j)
