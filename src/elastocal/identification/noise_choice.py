@@ -547,7 +547,7 @@ def not_knowing_times(found: NoiseFit) -> NoiseFit:
 
 
 def linearised(model: Model, observed: Observations, x: Array, columns: IntArray) -> Readings:
-    at = model.regressor(observed.table, x, columns, observed)
+    at = model.kept_regressor(observed, x, columns)
     n, size, table, sight, reach = len(observed.lead), observed.size, observed.table, None, None
     if table.position is not None and size == 3:
         offset = table.position[observed.lead] - model.cell.tracker.position

@@ -401,8 +401,7 @@ class Problem:
         return np.asarray(observed.value - self.model.predict(observed.table, x, observed))
 
     def regressor(self, x: Array, columns: NDArray[np.integer]) -> Regression:
-        observed = self.observations
-        return self.model.regressor(observed.table, x, columns, observed)
+        return self.model.kept_regressor(self.observations, x, columns)
 
     def whitened(self, x: Array, columns: NDArray[np.integer]) -> tuple[Array, Array]:
         """B (rows, columns) and residual (rows,) of a single part at x, whitened."""

@@ -54,6 +54,9 @@ class Regression:
         return self.observations.value - self.prediction
 
 
+KEPT = 2**22  # numbers of B that a model keeps at most
+
+
 class Model(ByValue):
     """p_i = h(q_i, f_i, …; X) for an arm with effects; CasADi differentiates it exactly.
 
@@ -136,6 +139,7 @@ class Model(ByValue):
         self.observe = cell.model.observe
         self.symbolic = SymbolicArm(chain, cell, extra, backend)  # its expressions
         self.parameters: tuple[Parameter, ...] = self.symbolic.parameters
+        self._kept: tuple[Any, Regression] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by what it is made of; another process derives the functions again."""
@@ -443,6 +447,18 @@ class Model(ByValue):
         check_equilibrium(self, table, h)
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
+
+    def kept_regressor(self, observed: Observations, x: Array, columns: NDArray) -> Regression:
+        """`regressor` of these readings, and what it found until others are asked for: where a fit
+        ends its weights begin, its held-out residuals and its faulty readings."""
+        asked, kept = (x.tobytes(), columns.tobytes()), self._kept
+        if kept is not None and kept[0] == asked and kept[1].observations is observed:
+            return kept[1]
+        found = self.regressor(observed.table, x, columns, observed)
+        found.B.flags.writeable = found.prediction.flags.writeable = False
+        if found.B.size <= KEPT:
+            self._kept = asked, found
+        return found
 
     def flange_poses(self, table: Measurements, x: Array | None = None) -> NDArray:
         """T_tracker_flange (n_rows, 4, 4) at parameter values x, deflections included."""
