@@ -57,7 +57,7 @@ class AnyModel:
         self.at, self.parameters, self.shrunk = x, [None] * n, np.zeros(n, dtype=bool)
         self.names = tuple(f"b{k}" for k in range(n))
 
-    def regressor(self, table, x, columns, observed):
+    def kept_regressor(self, observed, x, columns):
         y, J = (np.asarray(v) for v in self.f(x, self.at))
         return Regression(J[:, columns], y.ravel(), observed)
 
@@ -144,10 +144,10 @@ def test_linear_sets_through_the_fit_under_noise_that_was_estimated(name):
 class Reciprocal(AnyModel):
     """1/x, which has no value below zero."""
 
-    def regressor(self, table, x, columns, observed):
+    def kept_regressor(self, observed, x, columns):
         if x[0] <= 0:
             raise ElastocalError("no equilibrium")
-        return super().regressor(table, x, columns, observed)
+        return super().kept_regressor(observed, x, columns)
 
 
 def test_descent_turns_back_where_there_is_no_prediction():
