@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [--full] [--only PART …] [--beside SRC]
 
-Parts: evaluation, costs, fits (whole fits beside their peers).  What a part printed is kept in
-benchmarks/parts/, so that parts may run one by one.
+Parts: evaluation, costs, fits (whole fits beside their peers).  A part that does not run, or fails,
+stays in result.md as it stands there.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ TITLES = {
     "costs": "What the commands cost",
     "fits": "Whole fits beside their peers",
 }
-KEPT = HERE / "parts"
+RESULT = HERE / "result.md"
 
 
-def run_part(name: str, size: str, beside: Path | None) -> bool:
-    """Keeps what the part prints; False where it fails."""
+def run_part(name: str, size: str, beside: Path | None) -> str:
+    """What the part prints; nothing where it fails."""
     if name == "fits" and PEERS not in os.environ:
         print(f"fits: skipped, {PEERS} does not name the peers' Python (README.md)")
-        return True
+        return known_parts().get(name, "")
     command = [sys.executable, str(HERE / f"{name}.py"), "--size", size]
     if name == "fits":
         command = [sys.executable, str(HERE / "fits_peers.py"), *["--quick"] * (size != "full")]
@@ -39,9 +39,14 @@ def run_part(name: str, size: str, beside: Path | None) -> bool:
     print(f"--- {name}, {ran}", flush=True)
     done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, text=True)
     print(done.stdout)
-    if done.returncode == 0:
-        KEPT.joinpath(f"{name}.md").write_text(f"{ran}; {size} sizes.\n\n{done.stdout.strip()}\n")
-    return done.returncode == 0
+    return "" if done.returncode else f"{ran}; {size} sizes.\n\n{done.stdout.strip()}"
+
+
+def known_parts() -> dict[str, str]:
+    """What result.md has of each part."""
+    _, *sections = re.split(r"^## ", RESULT.read_text(encoding="utf-8"), flags=re.M)
+    texts = dict(section.split("\n", 1) for section in sections)
+    return {name: texts[title].strip() for name, title in TITLES.items() if title in texts}
 
 
 def goals(parts: dict[str, str]) -> list[str]:
@@ -60,17 +65,16 @@ def main() -> None:
     parser.add_argument("--beside", type=Path, help="costs: the folder src of another checkout")
     asked = parser.parse_args()
     size = "full" if asked.full else "short"
-    KEPT.mkdir(exist_ok=True)
-    failed = [name for name in asked.only if not run_part(name, size, asked.beside)]
-    parts = {n: p.read_text() for n in TITLES if (p := KEPT / f"{n}.md").exists()}
+    ran = {name: run_part(name, size, asked.beside) for name in asked.only}
+    parts = known_parts() | {name: text for name, text in ran.items() if text}
     lines = ["# Benchmarks: result", "", "Written by `make bench`; how: README.md.", ""]
     lines += goals(parts)
-    lines += [f"\n## {TITLES[name]}\n\n{text.strip()}" for name, text in parts.items()]
-    (HERE / "result.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    lines += [f"\n## {TITLES[name]}\n\n{text}" for name, text in parts.items()]
+    RESULT.write_text("\n".join(lines) + "\n", encoding="utf-8")
     for line in goals(parts):
         if "not met" in line:
             print(line)
-    if failed:
+    if failed := [name for name, text in ran.items() if not text]:
         sys.exit(f"failed: {', '.join(failed)}; their errors stand above")
 
 
