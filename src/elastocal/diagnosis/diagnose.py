@@ -263,7 +263,7 @@ def _diagnosed(
     dataset, found = few.before, few.selected
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
-    tests, answer = structure_tests(found.blocks), whole or few
+    tests, answer = structure_tests(found.first), whole or few
     answers = _pieces(answer, dataset, found.nothing.noise, tests, fields)
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}

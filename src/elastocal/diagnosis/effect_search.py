@@ -454,9 +454,8 @@ class ForwardSelection:
     """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
     p-value of the first of them, or else of the likeliest addition, against all that chance could
     have found, which is to be below `level`.  The set was fitted on `dataset`: columns about a fit
-    with its large effects.  `first` is the scan beside nothing under its own noise, `blocks` with
-    flips and, where something was chosen, of the blocks alone; `alone` is that under the final
-    noise; `signs` (FLIPS, C) are the flips."""
+    with its large effects.  `first` is the scan beside nothing under its own noise, `alone` under
+    the final noise; `signs` (FLIPS, C) are the flips."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
@@ -465,7 +464,7 @@ class ForwardSelection:
         flips = FLIPS, len(dataset.blocks.member)
         self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)
-        first = alone = scanned = self._scan(nothing)
+        first = alone = scanned = self._scan(nothing, beside=nothing)
         slots, visited, p = list[Slot](), set[frozenset[int]](), None
         while True:
             best, slot = self._best_addition(current, scanned)
@@ -502,14 +501,9 @@ class ForwardSelection:
         current, slots = self._paying(current, slots)
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
-        judged = replace(dataset, hypotheses=())
         if not current.items or p is None:
-            current, p, self.dataset = nothing, None, dataset
-            judged = dataset
-        own = self.signs, nothing.at.scattered
-        self.blocks = Scan(judged, generic, SOMETHING, nothing.data, nothing.noise, own)
-        self.chosen, self.slots = current, tuple(slots or [start])
-        self.p_value = self.blocks.chance if p is None else p
+            current, p, self.dataset = nothing, first.chance, dataset
+        self.chosen, self.slots, self.p_value = current, tuple(slots or [start]), p
         self.nothing, self.first, self.alone = nothing, first, alone
         self._fitted.clear()
 
