@@ -352,7 +352,7 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 # that of the mean over all starts, as with settings.
 
 ROWS = 3000  # of the equations, as many as tell one start from another
-REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
+REFERENCES = 4  # starts about which the whole model is evaluated, for the factors of the rows
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
 MOST_STEPS, STEP, ENOUGH = 40, 1e-7, 1e-8  # of the refinement, in widths of the starts and of χ²
