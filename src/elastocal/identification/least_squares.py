@@ -186,7 +186,7 @@ DEPENDS = 1e-6  # share of a parameter in such a direction above which it depend
 # By number: the power of I − Q_cQ_cᵀ in A_c, and what it is.
 POWERS = {
     "0": (0.0, "uncorrected (biased low with few {})"),
-    "1": (0.0, "corrected by G/(G − 1) · (n − 1)/(n − p), G {}"),
+    "1": (0.0, "corrected by G/(G − 1) · (n − 1)/(n − p)"),
     "2": (-0.5, "bias-reduced, unbiased under the working model"),
     "3": (-1.0, "nearly the jackknife over {}"),
 }
