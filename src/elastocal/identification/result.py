@@ -20,10 +20,8 @@ from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
-from elastocal.identification.noise_summary import Noise, ResidualSummary
+from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import Outlier
-from elastocal.identification.solve import SmoothPart
-from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.messages import (
     EXACT,
@@ -36,9 +34,8 @@ from elastocal.messages import (
 )
 from elastocal.model import calibrated
 from elastocal.model.effects.base import given_force
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import COMPONENTS, Observations, observe
-from elastocal.units import Array, IntArray, microns
+from elastocal.model.observations import COMPONENTS, observe
+from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms
@@ -297,7 +294,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Calibration(Result, Mapping[str, Estimate]):
+class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
 
     Attributes:
@@ -355,21 +352,12 @@ class Calibration(Result, Mapping[str, Estimate]):
         ['joint1.compliance']
     """
 
-    model: Model
     method: str
-    noise: Noise
     estimates: tuple[Estimate, ...]
     combinations: tuple[Combination, ...]
-    x: Array
-    determined: tuple[str, ...]
     spread: Covariance
     correlations: tuple[tuple[str, str, float], ...]
-    observations: Observations
-    residual: Array
-    held_out: Array
     sigma: float
-    dof: int
-    residual_rms: float
     heldout_rms: float
     nominal_rms: float
     converged: bool
@@ -377,9 +365,6 @@ class Calibration(Result, Mapping[str, Estimate]):
     outliers: tuple[Outlier, ...]
     excluded: tuple[Outlier, ...]
     warnings: tuple[str, ...]
-    weights: Weights
-    noise_parts: dict[str, float]
-    smooth: tuple[SmoothPart, ...] = ()
     test: TestErrors | None = None
     residual_summary: ResidualSummary | None = None
     faulty_report: OutlierReport | None = None
@@ -391,17 +376,6 @@ class Calibration(Result, Mapping[str, Estimate]):
     copies: tuple[int, ...] = ()
     shown: calibrated.ShownPoses | None = None
     scatter: calibrated.Scatter | None = None
-
-    @cached_property
-    def columns(self) -> IntArray:
-        """Indices (determined,) of the parameters `determined` among the model's."""
-        return np.array([self.model.names.index(n) for n in self.determined], dtype=np.int64)
-
-    @cached_property
-    def B(self) -> Array:
-        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
-        observed = self.observations
-        return self.model.regressor(observed.table, self.x, observations=observed).B
 
     @property
     def covariance(self) -> Array:

@@ -8,7 +8,8 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +17,9 @@ from scipy import linalg, special
 
 from elastocal.engine import Standardised, least_norm
 from elastocal.identification.least_squares import held_out_residual, left_out, rms_3d
+from elastocal.identification.noise_summary import Noise
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
-from elastocal.identification.solve import WORTH_A_COLUMN, reduce
+from elastocal.identification.solve import WORTH_A_COLUMN, SmoothPart, reduce
 from elastocal.identification.weighted_problem import Weights, weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
@@ -26,8 +28,38 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array, BoolArray, IntArray, microns
 
-if TYPE_CHECKING:
-    from elastocal.identification.result import Calibration
+
+@dataclass(frozen=True, repr=False, eq=False, kw_only=True)
+class FoundFit:
+    """What of a `Calibration` is looked at again; it says what each is."""
+
+    model: Model
+    x: Array
+    determined: tuple[str, ...]
+    observations: Observations
+    residual: Array
+    held_out: Array
+    dof: int
+    residual_rms: float
+    weights: Weights
+    noise: Noise
+    noise_parts: dict[str, float]
+    smooth: tuple[SmoothPart, ...] = ()
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """Indices (determined,) of the parameters `determined` among the model's."""
+        return np.array([self.model.names.index(n) for n in self.determined], dtype=np.int64)
+
+    @cached_property
+    def B(self) -> Array:
+        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
+        observed = self.observations
+        return self.model.regressor(observed.table, self.x, observations=observed).B
+
+    @property
+    def stage(self) -> IntArray:
+        return np.array([stage_of(p.effect) for p in self.model.parameters], dtype=np.int64)
 
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
@@ -55,7 +87,7 @@ class Influence:
     by: float
 
 
-def influence(fit: Calibration) -> tuple[Influence, ...]:
+def influence(fit: FoundFit) -> tuple[Influence, ...]:
     observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
     white, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
@@ -174,10 +206,10 @@ CHOSEN = "chosen"
 DRAWS = 1000
 
 
-def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
+def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
-    model, free, stage = fit.model, ~fit.model.shrunk, stages(fit.model)
+    model, free, stage = fit.model, ~fit.model.shrunk, fit.stage
     fitted = np.isin(np.arange(len(stage)), fit.columns) & free
     observed, weights, size = fit.observations, fit.weights, fit.observations.size
     white, typical, usual = weights.apply(fit.B), model.sizes(fit.B), np.flatnonzero(free)
@@ -236,18 +268,17 @@ def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
     return tuple(found)
 
 
-def _by_itself(fit: Calibration, columns: IntArray) -> Array:
+def _by_itself(fit: FoundFit, columns: IntArray) -> Array:
     """B (rows, columns) with what belongs to later stages at nominal: what moves the load would
     else pass for the compliances under it."""
-    stage = stages(fit.model)
-    later = (stage > stage[columns].max(initial=0)) & (fit.x != fit.model.nominal)
+    later = (fit.stage > fit.stage[columns].max(initial=0)) & (fit.x != fit.model.nominal)
     if not later.any():
         return fit.B[:, columns]
     x, observed = np.where(later, fit.model.nominal, fit.x), fit.observations
     return fit.model.regressor(observed.table, x, columns, observed).B
 
 
-def _refitted(fit: Calibration, y: Array, B: Array, weights: Weights) -> tuple[Array, Array]:
+def _refitted(fit: FoundFit, y: Array, B: Array, weights: Weights) -> tuple[Array, Array]:
     observed = fit.observations
     left = y - B @ least_norm(weights.apply(B), weights.apply(y))
     return left, held_out_residual(B, left, weights, observed.configuration, observed.size)
@@ -259,10 +290,6 @@ def stage_of(effect: str) -> int:
     if known.registered:
         return 0
     return 2 if known.stage in ("compliance", "load") else 1
-
-
-def stages(model: Model) -> IntArray:
-    return np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
 
 
 @dataclass(frozen=True)
@@ -296,7 +323,7 @@ class UncertaintyBudget:
 
 
 def uncertainty_budget(
-    fit: Calibration, arm: CalibratedArm, table: Measurements | None = None
+    fit: FoundFit, arm: CalibratedArm, table: Measurements | None = None
 ) -> UncertaintyBudget:
     B, at = fit.B, "the poses fitted"
     if table is not None:
@@ -333,7 +360,7 @@ class ErrorBudget:
     floor_name: str
 
 
-def gap_budget(result: Calibration) -> ErrorBudget | None:
+def gap_budget(result: FoundFit) -> ErrorBudget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
     functions; None where some configuration cannot be left out, and for tables too large to do it
     in passing.
@@ -347,7 +374,7 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
     large = len(result.residual) * len(result.determined) > MOST_BUDGETED
     if large or not np.isfinite(result.held_out).all():
         return None
-    stage = np.where(model.shrunk, len(STAGES) - 1, stages(model))
+    stage = np.where(model.shrunk, len(STAGES) - 1, result.stage)
     determined, observed = np.isin(model.names, result.determined), result.observations
     last = int(stage[determined].max(initial=0))
     _, code = np.unique(observed.configuration, return_inverse=True)
@@ -365,7 +392,7 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
     return ErrorBudget(tuple(steps), *_floor(result))
 
 
-def _fitted(result: Calibration, columns: IntArray, held: BoolArray) -> Array:
+def _fitted(result: FoundFit, columns: IntArray, held: BoolArray) -> Array:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
     model, B = result.model, _by_itself(result, columns)
     weights = weights_for(result.observations, model.cell.tracker, "auto")
@@ -379,7 +406,7 @@ def _fitted(result: Calibration, columns: IntArray, held: BoolArray) -> Array:
     return _refitted(result, y, B, weights)[1] if B.shape[1] else y
 
 
-def _floor(result: Calibration) -> tuple[float | None, str]:
+def _floor(result: FoundFit) -> tuple[float | None, str]:
     observed = result.observations
     parts = result.residual.reshape(-1, observed.size)[:, :3]
     square, dof = pure_error(observed.place, parts)
