@@ -183,15 +183,12 @@ ALONE = 1e-9  # 1 − leverage below which a cluster is fitted exactly, whatever
 ENTRIES = 2**22  # of a temporary array, 32 MB
 DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
 
-DESCRIPTION = {
-    "CR0": "uncorrected (biased low with few clusters)",
-    "CR1": "corrected by G/(G − 1) · (n − 1)/(n − p)",
-    "CR2": "bias-reduced, unbiased under the working model",
-    "CR3": "nearly the jackknife over clusters",
-    "HC0": "e² as it is (biased low in small samples)",
-    "HC1": "e² · n/(n − p)",
-    "HC2": "e²/(1 − h), unbiased under equal variances",
-    "HC3": "e²/(1 − h)², nearly the jackknife",
+# By number: the power of I − Q_cQ_cᵀ in A_c, and what it is.
+POWERS = {
+    "0": (0.0, "uncorrected (biased low with few {})"),
+    "1": (0.0, "corrected by G/(G − 1) · (n − 1)/(n − p)"),
+    "2": (-0.5, "bias-reduced, unbiased under the working model"),
+    "3": (-1.0, "nearly the jackknife over {}"),
 }
 
 
@@ -221,13 +218,14 @@ def clustered(
     meat, outer, alone = np.zeros((p, p)), np.zeros((p, p, p)), np.zeros(p, dtype=bool)
     lone: list[Any] = []
     size, trace, square = np.zeros((3, p))  # Σ aᵀa, tr Γ and tr Γ²
+    of_rows, (power, said) = kind[0] == "H", POWERS[kind[-1]]
     for Q, e, cluster in parts:
         n, G = n + len(e), G + len(np.unique(cluster))
         # Clusters of one size, in blocks of bounded memory.
         of_one_size = ((own, len(own) * p * max(own.shape[1], p)) for own in same_size(cluster))
         for rows in (b for own, n in of_one_size for b in np.array_split(own, -(-n // ENTRIES))):
             Qc = Q[rows]
-            adjusted, determined = adjusted_rows(Qc, POWERS[kind[-1]])
+            adjusted, determined = adjusted_rows(Qc, power)
             lone += cluster[rows[determined][:1, 0]].tolist()
             # A parameter may depend on a direction that one of the clusters determines alone.
             values, U = np.linalg.eigh(Qc[determined].transpose(0, 2, 1) @ Qc[determined])
@@ -248,25 +246,21 @@ def clustered(
             "a cluster-robust covariance compares clusters, but all rows are in one;"
             " measure more configurations, or use a covariance of independent rows (HC3)"
         )
-    of_rows, number = kind[0] == "H", kind[-1]
-    if lone and number == "3":
+    if lone and power == -1:
         raise InsufficientDataError(
             f"{named(lone[0])} alone determines a combination of the parameters: leaving it out, "
             f"as {kind} does, leaves no answer; fit fewer parameters or use {kind[:2]}2"
         )
-    if number == "1":
+    if kind[-1] == "1":
         meat *= G / (G - 1) * (n - 1) / (n - p)
     what = "each row its own variance" if of_rows else f"rows correlated within {G} clusters"
-    text = f"{what}, {DESCRIPTION[kind]}"
+    text = f"{what}, {said.format('rows' if of_rows else 'clusters')}"
     square = square + (outer**2).sum(axis=(1, 2))
     told = (trace > 1e-9 * size) & (square > 0) & ~alone  # the residual says something of it
     dof = np.where(told, trace**2 / np.where(told, square, 1.0), 0.0)
     if kind in ("HC0", "HC1"):
         dof = np.full(p, float(n - p))
     return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
-
-
-POWERS = {"0": 0.0, "1": 0.0, "2": -0.5, "3": -1.0}  # of I − Q_cQ_cᵀ in A_c
 
 
 def adjusted_rows(Qc: Array, power: float) -> tuple[Array, BoolArray]:

@@ -464,9 +464,7 @@ def groupings(
 # is standard normal, and the mean square Σ e² / Σ (1 − h) of any group of rows has expectation 1.
 # On f = Σ (1 − h) degrees of freedom it is judged by χ²: exactly for the whole table; for a group
 # the eigenvalues of its block of I − H are at most 1, which makes χ² with f err on the safe side.
-# Where only the shape of the noise is known, the common variance is s² = Σ e² / f over the table,
-# and z is internally studentised: z²/f ~ Beta(1/2, (f − 1)/2) (Cook and Weisberg 1982, section
-# 2.2).
+# Where only the shape of the noise is known, the common variance is s² = Σ e² / f over the table.
 
 FEWEST_VALUES = 8  # values that a group needs to be looked at on its own
 MOST_LISTED = 12  # groups of a grouping that are given in full, the most conspicuous ones
@@ -559,88 +557,69 @@ def summarise_residuals(
     alone = spare <= ALONE
     free: BoolArray | slice = ~alone if alone.any() else slice(None)  # of a large table no copies
     e, spare = whitened[free], spare[free]
-    f = float(spare.sum())
     if len(e) < FEWEST_VALUES or not e @ e > 0:
         return None
     if not absolute:
-        e = e / np.sqrt((e @ e) / f)
+        e = e / np.sqrt((e @ e) / float(spare.sum()))
     held = np.full(len(e), np.inf) if held_out is None else held_out[free]
-    table = _Table(e, spare, held, None if absolute else f)
-    judged = [(group, table.judged(*group[1:])) for group in groupings(observed, free)]
-    of_all = holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
+    z, judged = e / np.sqrt(spare), []
+    for by, code, names in groupings(observed, free):
+        total, f = (np.bincount(code, v, len(names)) for v in (e**2, spare))
+        count = np.bincount(code)
+        p = np.where(count >= FEWEST_VALUES, _two_sided(total, f), np.nan)
+        judged.append((by, code, names, count, p))
+    of_all = holm(np.concatenate([p for *_, p in judged] or [np.zeros(0)]))
     found = []
-    for group, p in judged:
+    for by, code, names, count, p in judged:
         adjusted, of_all = of_all[: len(p)], of_all[len(p) :]
-        found.append(table.grouping(*group, adjusted))
-    edges = table.edges(len(table.z))
-    whole = table.summary("all", slice(None), edges, None)
+        large = np.flatnonzero(count >= FEWEST_VALUES)
+        shown = np.sort(large[np.argsort(adjusted[large], kind="stable")][:MOST_LISTED])
+        edges = _edges(z, int(np.median(count[large])) if len(large) else FEWEST_VALUES)
+        members = ((k, np.flatnonzero(code == k)) for k in shown)
+        groups = tuple(
+            _summary(names[k], e[rows], spare[rows], held[rows], edges, float(adjusted[k]))
+            for k, rows in members
+        )
+        deviating = int((adjusted[large] < SIGNIFICANT).sum())
+        found.append(
+            Grouping(by, edges, groups, len(count), len(count) - len(large), deviating)
+        )  # fmt: skip
+    edges = _edges(z, len(z))
+    whole = _summary("all", e, spare, held, edges, None)
     return ResidualSummary(whole, edges, tuple(found), absolute, int(alone.sum()))
 
 
-class _Table:
-    """Rows with a residual e, 1 − h, held out, and f where the residuals told the size."""
+def _edges(z: Array, n: int) -> Array:
+    """Bin edges about 0 by Freedman and Diaconis, width 2 IQR n^(−1/3) for n values each, to the
+    largest value, or to 6 robust deviations where some lie far beyond."""
+    low, high = np.quantile(z, [0.25, 0.75])
+    largest = float(np.abs(z).max())
+    spread = float(high - low) or largest
+    reach = min(1.0001 * largest, 6 * spread / 1.349)
+    bins = int(np.clip(np.ceil(reach / (spread * n ** (-1 / 3))), 3, MOST_BINS))
+    return np.linspace(-reach, reach, (bins | 1) + 1)  # 0 in the middle of a bin
 
-    def __init__(self, e: Array, spare: Array, held: Array, dof: float | None) -> None:
-        self.e, self.z, self.spare = e, e / np.sqrt(spare), spare
-        self.held, self.dof = held, dof
 
-    def judged(self, code: NDArray[np.integer], names: NDArray[np.object_]) -> Array:
-        """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
-        total, f = (np.bincount(code, v, len(names)) for v in (self.e**2, self.spare))
-        return np.where(np.bincount(code) >= FEWEST_VALUES, _two_sided(total, f), np.nan)
-
-    def grouping(
-        self, by: str, code: NDArray[np.integer], names: NDArray[np.object_], holm: Array
-    ) -> Grouping:
-        count = np.bincount(code)
-        large = np.flatnonzero(count >= FEWEST_VALUES)
-        order = large[np.argsort(holm[large], kind="stable")]
-        shown = np.sort(order[:MOST_LISTED])
-        edges = self.edges(int(np.median(count[large])) if len(large) else FEWEST_VALUES)
-        groups = tuple(
-            self.summary(names[k], np.flatnonzero(code == k), edges, float(holm[k])) for k in shown
-        )
-        return Grouping(
-            by, edges, groups, len(count), len(count) - len(large),
-            int((holm[large] < SIGNIFICANT).sum()),
-        )  # fmt: skip
-
-    def edges(self, n: int) -> Array:
-        """Bin edges about 0 by Freedman and Diaconis, width 2 IQR n^(−1/3) for n values each, to
-        the largest value, or to 6 robust deviations where some lie far beyond."""
-        low, high = np.quantile(self.z, [0.25, 0.75])
-        largest = float(np.abs(self.z).max())
-        spread = float(high - low) or largest
-        reach = min(1.0001 * largest, 6 * spread / 1.349)
-        bins = int(np.clip(np.ceil(reach / (spread * n ** (-1 / 3))), 3, MOST_BINS))
-        return np.linspace(-reach, reach, (bins | 1) + 1)  # 0 in the middle of a bin
-
-    def summary(
-        self, name: str, rows: IntArray | slice, edges: Array, holm: float | None
-    ) -> GroupSummary:
-        z = self.z[rows]
-        counts, below = np.histogram(z, edges)[0], special.ndtr(edges)
-        if self.dof is not None and self.dof > 1:  # of a ratio to s from these rows: Thompson's τ
-            share = np.minimum(edges**2 / self.dof, 1.0)
-            below = 0.5 + 0.5 * np.sign(edges) * special.betainc(0.5, (self.dof - 1) / 2, share)
-        total, f = float((self.e[rows] ** 2).sum()), float(self.spare[rows].sum())
-        p = float(_two_sided(total, f))
-        unit = z / (np.abs(z).max() or 1.0)  # no power of it overflows
-        same = np.ptp(unit) < 1e-10
-        shape, omnibus, away = (0.0, 0.0), None, unit - unit.mean()
-        if not same:
-            square = away**2  # products: of other powers numpy takes the logarithm
-            kurtosis = float((square @ square) / len(z) / (variance := square.mean()) ** 2 - 3)
-            shape = float((square @ away) / len(z) / variance**1.5), kurtosis
-            omnibus = _p_normal(*shape, len(z)) if len(z) >= FEWEST_FOR_SHAPE else None
-        held = self.held[rows]
-        held = held[np.isfinite(held)]
-        points = GROUP_POINTS if holm is not None else 4 * GROUP_POINTS
-        return GroupSummary(
-            name, len(z), counts, len(z) * np.diff(below), int(len(z) - counts.sum()),
-            normal_scores(z, points), *shape, omnibus, total / f, f, p,
-            p if holm is None else holm, float(np.mean(held**2)) if held.size else None,
-        )  # fmt: skip
+def _summary(
+    name: str, e: Array, spare: Array, held: Array, edges: Array, adjusted: float | None
+) -> GroupSummary:
+    """Of rows with a residual e, 1 − h, and held out; the whole table has no `adjusted` p."""
+    z, total, f = e / np.sqrt(spare), float(e @ e), float(spare.sum())
+    counts, p = np.histogram(z, edges)[0], float(_two_sided(total, f))
+    unit = z / (np.abs(z).max() or 1.0)  # no power of it overflows
+    shape, omnibus, away = (0.0, 0.0), None, unit - unit.mean()
+    if np.ptp(unit) >= 1e-10:
+        square = away**2  # products: of other powers numpy takes the logarithm
+        kurtosis = float((square @ square) / len(z) / (variance := square.mean()) ** 2 - 3)
+        shape = float((square @ away) / len(z) / variance**1.5), kurtosis
+        omnibus = _p_normal(*shape, len(z)) if len(z) >= FEWEST_FOR_SHAPE else None
+    held = held[np.isfinite(held)]
+    points = GROUP_POINTS if adjusted is not None else 4 * GROUP_POINTS
+    return GroupSummary(
+        name, len(z), counts, len(z) * np.diff(special.ndtr(edges)), int(len(z) - counts.sum()),
+        normal_scores(z, points), *shape, omnibus, total / f, f, p,
+        p if adjusted is None else adjusted, float(np.mean(held**2)) if held.size else None,
+    )  # fmt: skip
 
 
 def _two_sided(total: ArrayLike, f: ArrayLike) -> Array:

@@ -203,8 +203,6 @@ METHODS = {
     "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
     "eq14-residual": "weighted least squares as published, weights of eq. (14) from each residual, "
     "iterated; it acts like a robust fit, and its stated intervals are far too narrow",
-    "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
-    "l1": "least sum of residual lengths (L1), robust like the median",
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
@@ -303,8 +301,7 @@ COMPARED = (  # the first is against the noise that is stated
 )
 SHAPES = {
     "residuals_skew": "errors are skewed, as with a missing effect.",
-    "residuals_heavy_tailed": "large errors are more frequent. A robust method (huber, l1) shows "
-    "whether the estimates depend on them.",
+    "residuals_heavy_tailed": "large errors are more frequent, as where single readings err.",
     "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",
 }
 
@@ -471,7 +468,6 @@ def in_time_line(result: Calibration) -> str | None:
     )
 
 
-FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
 PLACE = {"block": "Block of lines {}", "marker": "Marker {}", "configuration": "Configuration {}"}
 
 
@@ -485,7 +481,6 @@ def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
 def _fault(result: Calibration, finding: FaultyGroup) -> str:
     n, beyond = len(finding.lines), finding.beyond
     apart = {o.line for o in result.excluded} & set(finding.lines)
-    bends = method_of(result) in FULL_WEIGHT and not apart  # readings of full weight in the fit
     how = "err in common by" if finding.pattern == "common" else "scatter by"
     noise = f"{say.significant(finding.sigmas, 2)} times the noise"
     text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
@@ -497,7 +492,7 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     name = printable(finding.moves_most)
     if not math.isfinite(finding.influence):
         return f"{text}; the other readings leave {name} undetermined."
-    moves = "in the fit they move" if bends else "fitted along they would move"
+    moves = "fitted along they would move" if apart else "in the fit they move"
     count = say.significant(finding.influence, 2)
     return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
 
