@@ -419,7 +419,7 @@ def identify(
         test: Independent measurements to test the result on; they are never fitted.
         fixed: Parameter, place or effect to hold at its start.
         method: "auto" ("reml" unless `weights` are stated), "reml", "ols" (eq. 6 of Klimchik et
-            al. 2013), "wls" (eq. 10), "eq14", "eq14-residual".
+            al. 2013), "wls" (eq. 10), "eq14", "eq14-residual"; robust: "huber", "l1".
         noise: Noise that reml estimates: "auto", "independent", "axis", "marker", "groups",
             "polar", "stated"; with "+configuration" for deviations common to a configuration.
         weights: Stated noise to take as it is: "none", "rows", "axis", "polar", "covariance".

@@ -211,7 +211,7 @@ COSTLY = {
 }  # fmt: skip
 CHEAP = ("0", "-1", "1", "2", "1.5", "nan", "text", "", "1e3", "3,3", "quick", "inf", "-inf")
 VALUES = (
-    "auto", "reml", "ols", "huber", "eq14", "hc3", "cr2", "profile", "polar", "stated",
+    "auto", "reml", "ols", "huber", "l1", "eq14", "hc3", "cr2", "profile", "polar", "stated",
     "marker+configuration", "rows", "none", "drop", "keep", "urdf", "mjcf", "dh", "yaml", "json",
     "corrections", "tracker", "base", "D", "c", "O3", "joint2.compliance", "1,2,3",
     "0,0,0,1,1,1", "1500,200,1200", "joint2.compliance=nan", "scale=1e400", "replicates=x", "=",

@@ -56,10 +56,12 @@ GOLDENS: dict[str, Golden] = {
     "identify_convention": Golden(case("fanuc_convention"), (
         "identify cell.toml train.csv --test test.csv -o result.json -q",
     ), engine=True),
-    "identify_outliers": Golden(CAMPAIGN, (
+    "identify_robust": Golden(CAMPAIGN, (
         door.spoil_three,
         f"{PLACED} -o auto.json",
-        f"{PLACED} --outliers keep -o keep.json --residuals residuals.csv",
+        *(f"{PLACED} --method {method} -o {method}.json --residuals residuals.csv"
+          for method in ("huber", "l1")),
+        f"{PLACED} --outliers keep -o keep.json",
         f"{PLACED} --outliers drop -o drop.json",
     ), engine=True),
     "identify_methods": Golden(CAMPAIGN, (
@@ -90,7 +92,7 @@ GOLDENS: dict[str, Golden] = {
         f"{CURVED} -o ols.json --method ols",
         f"{CURVED} -o known.json --knowledge curved_knowledge.toml",
         f"{CURVED} -o profile.json --method wls --intervals profile --physical",
-        f"{CURVED} --method eq14",
+        f"{CURVED} --method huber",
         f"{CURVED} --intervals cr2",
         f"{CURVED} --intervals cr2 --physical",
         door.spoil_two,

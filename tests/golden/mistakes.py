@@ -155,6 +155,7 @@ OPTIONS = (
     Mistake("an output over an input", "identify placed.toml placed.csv -q -o placed.csv"),
     Mistake("an empty argument", f"{FIT} --report ''"),
     Mistake("no file of knowledge", f"{DEFLECT} --knowledge none.toml"),
+    Mistake("a method without constraints", f"{DEFLECT} --physical --method huber"),
     Mistake("a draw for smaller loads", "simulate placed.toml placed.csv -o o.csv --draw 1e6"),
     Mistake("no file of a covariance", f"{DEFLECT} --covariance noise.csv"),
     Mistake("a folder as a covariance", f"{DEFLECT} --covariance study"),
@@ -251,7 +252,7 @@ OPTIONS = (
 GONE = (
     Mistake("the compiled backend", "--backend compiled effects placed.toml"),
     Mistake("an estimator that goes by another name", "identify placed.toml placed.csv "
-            "-q -o out.json --method huber"),
+            "-q -o out.json --method mm"),
     Mistake("wild intervals", "identify placed.toml placed.csv -q -o out.json --intervals wild"),
     Mistake("hc4 intervals", "identify placed.toml placed.csv -q -o out.json --intervals hc4"),
     Mistake("bootstrap intervals", "identify placed.toml placed.csv -q -o out.json "

@@ -43,7 +43,7 @@ MANY = 0.05  # share of the readings fitted, above which those beyond the noise 
 SCATTERS = 0.01  # p-value below which joints settle anew at each visit, or something drifts
 NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
 # Excess kurtosis of the t distribution with 10 degrees of freedom, of which least squares uses
-# 94.5 % of the information.
+# 94.5 % of the information: beyond it a robust method is worth its while.
 HEAVY = 1.0
 FEW_DOF_PER_PARAMETER = 1.0
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
@@ -115,7 +115,8 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
     if mostly := mostly_prior(shares):
         yield _note("mostly_prior", parameters=mostly, share=tuple(shares[n] for n in mostly))
     if (summary := result.residual_summary) is not None:
-        yield shape_of(summary)
+        shape = shape_of(summary)  # its remedy, a robust fit, takes no knowledge
+        yield replace(shape, remedy="") if result.prior_share or result.active else shape
         if n := sum(g.n_deviating for g in summary.groupings):
             yield _note("scatter_unlike_noise_model", groups=n)
     yield from _test(result)

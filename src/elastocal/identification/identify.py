@@ -36,7 +36,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.noise_summary import noise_of, summarise_residuals
-from elastocal.identification.outliers import describe, drops, find_faulty, settle
+from elastocal.identification.outliers import describe, drops, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
     left_open,
@@ -58,6 +58,7 @@ from elastocal.identification.solve import (
     solve,
 )
 from elastocal.identification.start import (
+    ROBUST,
     IntervalKind,
     Options,
     check_rows,
@@ -171,10 +172,12 @@ def _course(
         covariance = _of_readings(options.covariance, good, observed.size)
         weights = weights_for(some, model.cell.tracker, kind, covariance)
         problem = posed(model, some, weights, x0, own)
-        if problem.large and options.noise != "auto":
+        if problem.large and (options.method in ROBUST or options.noise != "auto"):
+            asked = f"method {options.method}"
+            asked = asked if options.noise == "auto" else f"noise model '{options.noise}'"
             raise InputError(
-                f"the noise model '{options.noise}' takes no table of this size; use the default "
-                "method, which excludes outliers and scales stated or equal noise to the residual"
+                f"the {asked} takes no table of this size; use the default method, which excludes "
+                "outliers and scales stated or equal noise to the residual"
             )
         solution = solve(problem, progress, not smooth)
         if some.kind == "pose" and weights.kind == "none" and kind == "auto":
@@ -580,6 +583,8 @@ def _by_method(course: Course) -> MethodResult:
     method, exact = options.resolved, sound.exact
     if method == "reml" and not every.problem.large and not exact:
         return _reml(course)
+    if method in ROBUST:
+        return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
     explained = partial(_explained, course.report, ~faulty)
     drop = drops(options, every.problem.observations, faulty, explained)

@@ -242,8 +242,10 @@ def remedies() -> dict[str, str]:
         "poses.",
         "residual_below_stated_noise": "State the tracker's true noise: with noise stated too "
         "large, a missing effect does not show.",
-        "residuals_heavy_tailed": "Look for what makes single readings err: line of sight, "
-        "vibration, a tracker that has not settled.",
+        "residuals_heavy_tailed": f"Compare with a robust fit ({option('method')} huber or l1): "
+        "where parameters differ by more than their intervals, far readings decide them; look for "
+        "what makes single readings err (line of sight, vibration, a tracker that has not "
+        "settled).",
         "test_data_far": "Measure poses like those of the test: the fit extrapolates to them.",
         "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
         "(joints, load), fit some like them; where they do not, the arm or the tracker has changed "

@@ -40,14 +40,16 @@ IntervalKind = Literal[
     "profile",
 ]  # fmt: skip
 KINDS = get_args(IntervalKind)
-Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual"]
+Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "l1"]
 FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
+ROBUST = ("huber", "l1")
+WITH_KNOWLEDGE = ("auto", "profile")
 # What there was once, or is looked for by this name: what does the same.
 SUCCESSORS = {
     "method": dict.fromkeys(
-        ("huber", "l1", "lts", "s", "mm", "tukey", "student-t"),
-        "the default method, which excludes what the fit of the majority contradicts",
+        ("lts", "s", "mm", "tukey", "student-t"),
+        "the default method, which excludes what the fit of the majority contradicts, or huber",
     ),
     "intervals": {
         "wild": "cr2, which allows any correlation within a configuration as well",
@@ -101,25 +103,28 @@ class Options:
                 f"{option('covariance')} goes with {option('weights', 'covariance')}; found "
                 f"{quoted(self.weights)}, leave one of the two out"
             )
-        if stated and self.weights != "none" and self.resolved != "wls":
+        if stated and self.weights != "none" and self.resolved not in ("wls", *ROBUST):
             raise InputError(
                 f"the method {self.resolved} does not take stated weights; choose the method wls"
             )
         if self.knows:
-            what, remedy = "neither constraints nor a prior", "with these there are auto, profile"
-            self._check_intervals(("auto", "profile"), what, remedy)
+            remedy = f"with these there are {', '.join(WITH_KNOWLEDGE)}"
+            self._refuse(ROBUST, WITH_KNOWLEDGE, "neither constraints nor a prior", remedy)
 
     def check_functions(self) -> None:
+        without = (*ROBUST, "eq14", "eq14-residual")
         what = "no prior, which smooth functions have"
-        if self.resolved in ("eq14", "eq14-residual"):
+        self._refuse(without, ("auto", "classical"), what, "leave it away")
+
+    def _refuse(
+        self, without: tuple[str, ...], intervals: tuple[str, ...], what: str, remedy: str
+    ) -> None:
+        if self.resolved in without:
             raise InputError(
                 f"the method {self.resolved} takes {what}; use the default method, which excludes "
                 "outliers"
             )
-        self._check_intervals(("auto", "classical"), what, "leave it away")
-
-    def _check_intervals(self, known: tuple[str, ...], what: str, remedy: str) -> None:
-        if self.intervals not in known:
+        if self.intervals not in intervals:
             raise InputError(f"{option('intervals', self.intervals)} knows of {what}; {remedy}")
 
     @property

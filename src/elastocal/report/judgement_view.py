@@ -203,6 +203,8 @@ METHODS = {
     "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
     "eq14-residual": "weighted least squares as published, weights of eq. (14) from each residual, "
     "iterated; it acts like a robust fit, and its stated intervals are far too narrow",
+    "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
+    "l1": "least sum of residual lengths (L1), robust like the median",
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
@@ -301,7 +303,8 @@ COMPARED = (  # the first is against the noise that is stated
 )
 SHAPES = {
     "residuals_skew": "errors are skewed, as with a missing effect.",
-    "residuals_heavy_tailed": "large errors are more frequent, as where single readings err.",
+    "residuals_heavy_tailed": "large errors are more frequent. A robust method (huber, l1) shows "
+    "whether the estimates depend on them.",
     "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",
 }
 
