@@ -168,7 +168,7 @@ def test_fewer_equations_than_parameters(model):
 def test_the_test_table_is_checked_too(model):
     other = table_for(model, seed=1)
     wrong = replace(other, position=other.position * 1e3, source="other.csv")
-    told = r"other\.csv: the readings extend over .* mm read as m"
+    told = r"other\.csv: the readings extend over .* millimetres"
     refused(model, table_for(model), InputError, told, test=wrong)
 
 

@@ -299,8 +299,7 @@ def joint_maps(chain: Chain) -> list[JointMap]:
     return [none, *signs, *couplings, *others, *(b.after(a) for a, b in pairs)]
 
 
-UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (1e-2, "cm read as m"),
-         (10.0, "cm read as mm"), (25.4, "inches read as mm"), (0.0254, "inches read as m"),
+UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
          (1 / 25.4, "mm read as inches"))  # fmt: skip
 SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
 ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
@@ -378,8 +377,7 @@ def _of_positions(
         )
     unit = next((u for u in UNITS if abs(scale / u[0] - 1) < OF_A_UNIT), None)
     if unit is not None:
-        words = [f"if positions were {unit[1]} (rename their columns, or convert them)", *words]
-        return position * unit[0], words
+        return position * unit[0], [f"if positions were {unit[1]}", *words]
     if abs(scale - 1) > SCALED:
         cause = ANOTHER if abs(scale - 1) > OF_A_TARGET else SCALE
         words.append(f"with all positions {rounded(scale, 4)} times as far apart ({cause})")

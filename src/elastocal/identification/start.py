@@ -410,15 +410,15 @@ def _distance_start(model: Model, table: Measurements, x: Array, movable: set[in
     return values(min(tried, key=lambda one: float(one.cost)).x)
 
 
-# Readings and nominal arm may differ this much in extent (a long tool, few joints moving) before a
-# wrong unit is looked for, and before it is the likelier cause where nothing else tells.
-UNLIKE, EXTENT_FACTOR = 3.0, 30.0
-OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
+# Readings and nominal arm may differ this much in extent (a long tool, few joints moving)
+# before a wrong unit is the likelier cause.
+EXTENT_FACTOR = 30.0
+SMALL_ANGLE = np.radians(2 * np.pi)  # what a full turn in rad reads as in degrees
 OVERSHOOT = np.radians(0.5)  # controllers overshoot soft limits by a little
 SAME = 1e-9
 SOME = 2**14  # readings that are enough to tell their unit
 
-# What may be wrong with a table that no arm explains; "" where nothing tells.
+# What may be wrong with a table whose joint values no arm can take; "" where nothing tells.
 Mistake = Callable[[Model, Measurements], str]
 
 
@@ -445,7 +445,7 @@ def check_rows(model: Model, table: Measurements, mistake: Mistake) -> None:
             k = int(np.argwhere(~np.isfinite(values))[0][0])
             raise InputError(f"{table.source}, line {table.row[k]}: {name} is not finite")
     check_limits(model, table, mistake)
-    _check_units(model, table, mistake)
+    _check_units(model, table)
 
 
 def check_limits(model: Model, table: Measurements, mistake: Mistake | None = None) -> None:
@@ -471,30 +471,57 @@ def check_limits(model: Model, table: Measurements, mistake: Mistake | None = No
         )
 
 
-def _check_units(model: Model, table: Measurements, mistake: Mistake) -> None:
+def _check_units(model: Model, table: Measurements) -> None:
     if table.position is None:
         return
-    some = table  # some of many readings tell it as well
-    if len(table) > SOME:
-        some = table.take(np.linspace(0, len(table) - 1, SOME).astype(np.int64))
-    flange, position = model.rigid.flange_poses(some)[:, :3, 3], np.asarray(some.position)
-    reach, extent = (float(np.linalg.norm(np.ptp(at, axis=0))) for at in (flange, position))
-    if reach < SAME or extent < SAME or 1 / UNLIKE < extent / reach < UNLIKE:
+    if len(table) > SOME:  # some of many readings tell it as well
+        table = table.take(np.linspace(0, len(table) - 1, SOME).astype(np.int64))
+    flange, position = model.rigid.flange_poses(table), np.asarray(table.position)
+    reach = float(np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0)))
+    extent = float(np.linalg.norm(np.ptp(position, axis=0)))
+    if reach < SAME or extent < SAME:
         return
+    ratio = extent / reach
     # That of most: one that is far off, as by a slip of the key, tells of no unit.
     usual = 2 * np.median(np.linalg.norm(position - np.median(position, axis=0), axis=1)) / reach
-    if not (cause := mistake(model, table)):
-        if min(extent / reach, usual) > EXTENT_FACTOR:
-            cause = "the positions are probably millimetres in columns named …_m (rename to …_mm), "
-            cause += "or the joints radians in columns named …_deg"
-        elif extent / reach < 1 / EXTENT_FACTOR:
-            cause = "the positions are probably metres in columns named …_mm: rename to …_m"
-        else:
-            return
+    small = ratio >= 3 and "prismatic" not in model.chain.kinds
+    if small and np.abs(table.q).max() <= SMALL_ANGLE and (
+        # The arm hardly moves, and turned back it moves as measured.
+        1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
+    ):  # fmt: skip
+        cause = "the joint angles are probably radians in columns named …_deg: rename to …_rad"
+    elif (unit := _unit_of(flange, position, table.marker, reach)) is not None:
+        factor, cause = unit
+        cause = f"the positions are probably {cause}: convert them (elastocal import), or multiply "
+        cause += f"them by {factor:g}"
+    elif ratio > EXTENT_FACTOR and usual > EXTENT_FACTOR:
+        cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
+    elif ratio < 1 / EXTENT_FACTOR:
+        cause = "the positions are probably metres in columns named …_mm: rename to …_m"
+    else:
+        return
     raise InputError(
         f"{table.source}: the readings extend over {rounded(extent * 1e3, 4)} mm, but the nominal "
         f"arm's flange moves over {rounded(reach * 1e3, 4)} mm at these joint values; {cause}"
     )
+
+
+# By what readings of the same shape as the nominal arm's places may have to be multiplied.
+CONVERTED = {
+    10.0: "centimetres in columns named …_mm", 25.4: "inches in columns named …_mm",
+    0.01: "centimetres in columns named …_m", 0.0254: "inches in columns named …_m",
+}  # fmt: skip
+OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
+ALIKE = 0.05  # of the arm's reach: what its own errors leave of a likeness
+
+
+def _unit_of(
+    flange: Array, position: Array, marker: IntArray, reach: float
+) -> tuple[float, str] | None:
+    some = np.unique(np.linspace(0, len(marker) - 1, SAMPLE).astype(int))
+    found = LinearFits(flange[None, some], position[some], marker[some])
+    near = (u for u in CONVERTED.items() if abs(found.scale[0] / u[0] - 1) < OF_A_UNIT)
+    return next(near, None) if found.left[0] < ALIKE * reach else None
 
 
 FAR_OFF = 10.0  # times the median, which is more than any noise is
@@ -511,6 +538,10 @@ def nothing_shown(observed: Observations, residual: Array) -> InsufficientDataEr
         told = f"no parameter shows beside the reading of line {line}, which is "
         told += f"{length(far.max())} off: correct it, or drop it"
     return InsufficientDataError(f"{observed.table.source}: {told}")
+
+
+def _reach(model: Model, table: Measurements) -> float:
+    return float(np.linalg.norm(np.ptp(model.rigid.flange_poses(table)[:, :3, 3], axis=0)))
 
 
 def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
