@@ -654,7 +654,7 @@ def robust_result(
         fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
     )
     solution = replace(sound, fit=fit)
-    solution = replace(solution, held=(heldout, solution.crossed[1]))
+    solution = replace(solution, held=(heldout, *solution.crossed[1:]))
     labels = np.array(observed.table.configuration_labels)
     cluster = None if intervals == "auto" else labels[observed.configuration]
     return MethodResult(method, solution, found.covariance(cluster), None, good)
