@@ -216,6 +216,7 @@ def _named(result: Calibration) -> list[str]:
 def _state_noise(result: Calibration) -> str:
     keys, ask = "sigma_um, or range_um and transverse_um", "elastocal diagnose looks for that"
     keys = "distance_um" if result.model.observe == "distance" else keys
+    keys = f"{keys}, and rotation_urad" if result.model.observe == "pose" else keys
     return (
         f"State the tracker's noise ([tracker] {keys}): only beside it does the residual say "
         f"whether the model lacks something.{'' if _named(result) else f' {ask} either way.'}"
