@@ -43,7 +43,7 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     predicted_error,
 )
-from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
+from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors, made
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.solve import (
     Course,
@@ -283,7 +283,7 @@ def summarise(
     heldout, leverage, _ = solution.crossed
     there = np.isfinite(heldout)  # under a drift one that is not would reach all
     plainly_large = problem.large and solution.held is None
-    report = None
+    report, stated = None, found.contradicted
     if not every.exact:
         fitted = found.solution if set_apart or found.smooth else course.sound
         report = report_faulty(every, fitted, found.noise, found.good, found.standard)
@@ -305,6 +305,7 @@ def summarise(
         faulty_report=report, active=found.active, prior_share=found.prior_share,
         smooth=found.smooth, left=left_open(own_sizes, found.limits), copies=copies,
         shown=_shown(solution, covariance),
+        findings=(made("care", "knowledge_contradicted", **stated),) if stated else (),
     )  # fmt: skip
     predicted = predicted_error(
         result.arm, observed, result.excess, found.spread,

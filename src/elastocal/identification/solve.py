@@ -674,11 +674,11 @@ class MethodResult:
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
     fit. What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
-    many parameters the readings paid for (`effective`; None: all fitted), and `warnings` where the
-    readings contradict them.  `smooth` are the smooth functions, `beside` which σ of a whitened row
-    and its degrees of freedom were found, and `standard` (N, size) the residuals of all readings
-    free of the fit's part in them.  `limits` are the 95 % intervals of the parameters that the
-    readings hardly show, by their index.
+    many parameters the readings paid for (`effective`; None: all fitted), and what of them is
+    `contradicted`.  `smooth` are the smooth functions, `beside` which σ of a whitened row and its
+    degrees of freedom were found, and `standard` (N, size) the residuals of all readings free of
+    the fit's part in them.  `limits` are the 95 % intervals of the parameters that the readings
+    hardly show, by their index.
     """
 
     method: str
@@ -690,6 +690,7 @@ class MethodResult:
     prior_share: dict[str, float] = field(default_factory=dict)
     effective: int | None = None
     warnings: tuple[str, ...] = ()
+    contradicted: dict[str, Any] = field(default_factory=dict)
     smooth: tuple[SmoothPart, ...] = ()
     beside: tuple[float, float] | None = None
     standard: Array | None = None
