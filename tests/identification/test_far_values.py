@@ -273,3 +273,18 @@ def test_deflections_are_small_but_their_positions_tell_swapped_columns() -> Non
     mended = "no deflections of this arm.*the readings fit the nominal arm only to .* they would"
     with pytest.raises(ec.InsufficientDataError, match=mended):
         ec.identify(model, mirrored)
+
+
+def test_positions_show_that_a_base_stands_otherwise_and_deflections_how(tmp_path):
+    effects, told = ["joint_compliance"], 'observe = "deflection"\n'
+    path, turned = (cell(tmp_path, name, effects=effects) for name in ("as", "turned"))
+    fitted = cell(tmp_path, "fitted", effects=["base_frame", *effects])
+    for one in (path, turned, fitted):
+        stands = "[model.nominal]\nbase_rpy_deg = [0, 0, 20]" * (one == turned)
+        one.write_text(one.read_text() + told + stands)
+    true = {f"joint{j}.compliance": 1e-5 for j in range(1, 7)}
+    data = ec.simulate(turned, poses(20, 1), values=true, load=(0, 0, -2000), seed=1)
+    assert "base turned by 20.0° from" in " ".join(ec.identify(path, data).warnings)
+    found = ec.identify(fitted, data).to_json()
+    (rz,) = (p["value"] for p in found["parameters"] if p["name"] == "base.rz")
+    assert rz == pytest.approx(np.radians(20), abs=0.01) and not found["warnings"]

@@ -69,6 +69,7 @@ from elastocal.identification.start import (
     ordinary,
     solved_body,
     start_values,
+    turned_base,
     without_copies,
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
@@ -123,9 +124,10 @@ def identify(
     found = run_method(course)
     progress("intervals and held-out residuals")
     result = summarise(course, found, new_poses, copies, test)
-    body = solved_body(table, float(found.solution.fit.residual.std()))
+    left = found.solution.fit.residual
+    body = solved_body(table, float(left.std())), turned_base(model, observed, left)
     told = (*told, *_doubts(model, table, test, result.x))
-    return replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
+    return replace(result, warnings=(*told, *result.warnings, *filter(None, body)))
 
 
 def _doubts(
