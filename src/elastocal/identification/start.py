@@ -524,6 +524,7 @@ def _unit_of(
     return next(near, None) if found.left[0] < ALIKE * reach else None
 
 
+FITS = 0.03  # m, which nominal arms keep to the positions of their readings
 FAR_OFF = 10.0  # times the median, which is more than any noise is
 
 
@@ -533,7 +534,11 @@ def nothing_shown(observed: Observations, residual: Array) -> InsufficientDataEr
     far = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
     told = "the readings do not depend on any parameter of the model; measure other poses or loads,"
     told += " or choose other effects"
-    if far.max() > FAR_OFF * np.median(far):
+    if (off := float(np.median(far))) > FITS:
+        told = f"no parameter shows beside readings that lie {length(off)} (median) from the model "
+        told += f"as it is held: check {option('fixed')} and [model.nominal] base_position_m, or "
+        told += "fit base_frame and marker_position"
+    elif far.max() > FAR_OFF * off:
         line = observed.table.row[observed.lead[far.argmax()]]
         told = f"no parameter shows beside the reading of line {line}, which is "
         told += f"{length(far.max())} off: correct it, or drop it"
@@ -756,9 +761,6 @@ class Fallen:
             f"{text}. If it is mounted as stated, {self.axis} of that frame points up: write the "
             f"columns {', '.join(self.columns)} as x, y, z; else state [model.nominal] base_rpy_deg"
         )
-
-
-FITS = 0.03  # m, which nominal arms keep to the positions of their readings
 
 
 def turned_base(model: Model, observed: Observations, residual: Array) -> str | None:
