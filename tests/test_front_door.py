@@ -13,6 +13,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from support.design_commands import elastocal as command
 
@@ -218,6 +219,8 @@ def test_compensate_is_that_of_the_command_line(fit):
     in_memory = ec.compensate(fit.arm, TARGETS, load=LOAD)
     np.testing.assert_allclose(in_memory.q, commands.q, atol=1e-12)
     assert len(in_memory) == 3 and in_memory.reached.all()
+    frame = pd.read_csv("targets.csv")[["z_mm", "x_mm", "y_mm"]]  # columns count by their names
+    np.testing.assert_array_equal(ec.compensate(fit.arm, frame, load=LOAD).q, commands.q)
 
 
 def test_every_result_reports_plots_and_tabulates_itself(fit, plan):

@@ -64,14 +64,17 @@ class Targets:
 
 
 def read_targets(
-    path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
-) -> Targets:
+    path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None,
+    text: str | None = None,
+) -> Targets:  # fmt: skip
     """Targets of a CSV or Parquet file whose columns are those of the measurement table: x_mm,
     y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone, or both:
     joints are then the nominal command to start from.  force_x_N … and circumstances (time_s,
     approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force` (3,) N acts
     where the table states none."""
-    table = measurements.read_measurements(path, joint_kinds=joint_kinds, observe="targets")
+    table = measurements.read_measurements(
+        path, joint_kinds=joint_kinds, observe="targets", text=text
+    )
     q = table.q if table.q.shape[1] else None
     placed, turned = table.position is not None, table.rotation is not None
     extra = "; a rotation alone is no target" * (turned and q is None)

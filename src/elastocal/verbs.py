@@ -562,7 +562,7 @@ def diagnose(
 @checked_arguments
 def compensate(
     arm: CalibratedArm | Calibration,
-    targets: Targets | str | Path | ArrayLike,
+    targets: Targets | str | Path | DataFrame | ArrayLike,
     *,
     load: ArrayLike | None = None,
     frame: Literal["base", "tracker"] = "base",
@@ -579,7 +579,7 @@ def compensate(
     Args:
         arm: `fit.arm`, or the `Calibration` itself, or what `read_calibrated` gives.
         targets: Positions (n, 3) or (3,) in m of the tool's point, poses (n, 4, 4) or (4, 4) of
-            the tool, or a table of targets (CSV or Parquet).
+            the tool, or a table of targets (CSV, Parquet or a data frame).
         load: Force (3,) in N at the load point, in `frame`, where the table states none.
         frame: Frame of targets and forces: "base" (as identified) or "tracker".
         point: Point of the tool: a marker, or x,y,z in m in the flange frame; default: the load
@@ -637,9 +637,8 @@ def check_frame(frame: str) -> None:
 
 
 def _targets(
-    targets: Targets | str | Path | ArrayLike, kinds: tuple[str, ...],
-    frame: Literal["base", "tracker"], force: Array | None,
-) -> Targets:  # fmt: skip
+    targets: Any, kinds: tuple[str, ...], frame: Literal["base", "tracker"], force: Array | None
+) -> Targets:
     import numpy as np
 
     from elastocal.compensation import Targets, read_targets, targets_at
@@ -648,6 +647,9 @@ def _targets(
         return targets
     if isinstance(targets, str | Path):
         return read_targets(targets, kinds, frame, force)
+    if hasattr(targets, "to_csv"):
+        text = targets.to_csv(index=any(targets.index.names))
+        return read_targets("DataFrame", kinds, frame, force, text)
     found = np.asarray(targets, dtype=float)
     if found.shape in ((3,), (4, 4)):
         found = found[None]

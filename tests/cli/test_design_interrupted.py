@@ -25,8 +25,7 @@ GOING_ON = "resuming the interrupted design"
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    cell = write_cell(folder)
-    assert design(cell).exit_code == 0
+    assert design(write_cell(folder)).exit_code == 0
     return (folder / "plan.csv").read_bytes()
 
 

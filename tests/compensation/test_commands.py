@@ -284,8 +284,7 @@ def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
     axes = joint_box((2, 1, 1, 1, 1, 1))
     assert correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN).warnings == ()
     axes[4] = np.zeros(1)
-    found = correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN)
-    (told,) = found.warnings
+    (told,) = correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN).warnings
     assert told.startswith("only 0 of 2 grid points are exact")
     assert "singular by the levels of q5_deg = 0;" in told and "q4" not in told and "q6" not in told
 

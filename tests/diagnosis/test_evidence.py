@@ -17,8 +17,7 @@ SEEDS = range(2)
 
 
 def group(data: NoisyData, seed: int, k: int = 3) -> np.ndarray:
-    rng = np.random.default_rng((seed, 11))
-    return data.masked(1e-5 * rng.normal(size=(*data.r.shape, k)))
+    return data.masked(1e-5 * np.random.default_rng((seed, 11)).normal(size=(*data.r.shape, k)))
 
 
 def dense_evidence(data: NoisyData, C: np.ndarray, s: float) -> float:

@@ -36,8 +36,7 @@ def sided() -> Measurements:
 def shuffled(table: Measurements) -> Measurements:
     order = np.random.default_rng(7).permutation(table.configuration.max() + 1)
     rows = np.argsort(order[table.configuration], kind="stable")
-    moved = table.take(rows)
-    return replace(moved, move=None, direction=None)
+    return replace(table.take(rows), move=None, direction=None)
 
 
 def test_sides_that_contradict_the_order_are_told_and_nothing_rests_on_it() -> None:

@@ -44,8 +44,7 @@ def test_noise_of_poses_is_nothing() -> None:
 
 def test_a_gap_of_twelve_times_the_noise_is_not_nothing() -> None:
     """A joint jumped, and no effect that jumps is in the catalogue; errors add up."""
-    jumps = ("encoder_jump", "frame_jump", "marker_slip")
-    why = diagnosed("jump_untimed", without=jumps)
+    why = diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
     gap = why.gap
     assert why.verdict == "unknown_effect" and why.probability_nothing < 0.02
     assert gap.unexplained > 5 * gap.noise_floor

@@ -47,8 +47,7 @@ def test_flange_of_packaged_robots(name: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_branches_slides_and_joints_above_the_base(seed: int, tmp_path: Path) -> None:
-    path = tmp_path / "arm.urdf"
-    path.write_text(random_chain_urdf(seed))
+    (tmp_path / "arm.urdf").write_text(random_chain_urdf(seed))
     cell, result = write_result(
         tmp_path, 'urdf = "arm.urdf"\nbase = "base"\nflange = "flange"', GEOMETRY, seed=seed
     )

@@ -147,8 +147,7 @@ def json_changed(text: str, rng: Random) -> str:
 
 
 def places_of(tree: Any, depth: int = 0) -> Any:
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree)
-    for key, value in list(items)[:40]:
+    for key, value in list(tree.items() if isinstance(tree, dict) else enumerate(tree))[:40]:
         yield tree, key
         if isinstance(value, dict | list) and depth < 5:
             yield from places_of(value, depth + 1)

@@ -218,8 +218,7 @@ def built_in_python(folder: Path) -> dict[str, Any]:
     """A cell made of objects, simulated and identified without a file of its own."""
     cell = ec.read_cell("placed.toml")
     made = ec.Model(cell)
-    poses = made.read_plan("plan270.csv")
-    data = ec.simulate(made, poses, load=[0, 0, -1000], seed=3)
+    data = ec.simulate(made, made.read_plan("plan270.csv"), load=[0, 0, -1000], seed=3)
     fit = ec.identify(made, data, prior={"joint2.compliance": {"mean": 2.9e-7, "std": 1e-9}})
     return {"repr": [repr(cell)[:60], repr(data)],
             "parameters": [{"name": e.name, "value": e.value, "std": e.std}

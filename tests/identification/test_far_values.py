@@ -108,8 +108,7 @@ def test_intervals_hold_on_an_arm_whose_errors_are_five_typical_sizes(tmp_path):
 
 
 def test_a_zero_is_named_though_nothing_is_to_be_trusted(tmp_path):
-    path = cell(tmp_path)
-    lost = {"joint2.offset": np.radians(-12.0)}
+    path, lost = cell(tmp_path), {"joint2.offset": np.radians(-12.0)}
     fit = ec.identify(path, disturbed(ec.simulate(path, poses(50, 2), values=lost, seed=2)))
     assert not fit.verdict.trusted
     assert "zero of joint 2 is off by 12" in fit.finding("joint_zero").remedy
@@ -124,6 +123,10 @@ def test_lengths_of_another_arm_are_named_and_doubted_only_where_much_is_left(tm
     fit = ec.identify(path, disturbed(clean))
     assert fit.finding("unheard_of").numbers["parameters"] == ("link2.dx",)
     assert not fit.verdict.trusted and "implausible values" in sentence(fit)
+    path = cell(tmp_path, effects=[*WHOLE, "joint_compliance"])  # and where the load acts
+    true = {"link6.dx": 0.04, **{f"joint{j}.compliance": 1e-5 for j in range(1, 7)}}
+    fit = ec.identify(path, ec.simulate(path, poses(50, 1), values=true, load=(0, 0, -99), seed=1))
+    assert "[tool] load_point_m" in fit.finding("far_from_nominal").remedy
 
 
 def test_what_diagnose_named_is_not_doubted_for_its_size(tmp_path):
@@ -270,3 +273,18 @@ def test_deflections_are_small_but_their_positions_tell_swapped_columns() -> Non
     mended = "no deflections of this arm.*the readings fit the nominal arm only to .* they would"
     with pytest.raises(ec.InsufficientDataError, match=mended):
         ec.identify(model, mirrored)
+
+
+def test_positions_show_that_a_base_stands_otherwise_and_deflections_how(tmp_path):
+    effects, told = ["joint_compliance"], 'observe = "deflection"\n'
+    path, turned = (cell(tmp_path, name, effects=effects) for name in ("as", "turned"))
+    fitted = cell(tmp_path, "fitted", effects=["base_frame", *effects])
+    for one in (path, turned, fitted):
+        stands = "[model.nominal]\nbase_rpy_deg = [0, 0, 20]" * (one == turned)
+        one.write_text(one.read_text() + told + stands)
+    true = {f"joint{j}.compliance": 1e-5 for j in range(1, 7)}
+    data = ec.simulate(turned, poses(20, 1), values=true, load=(0, 0, -2000), seed=1)
+    assert "base turned by 20.0° from" in " ".join(ec.identify(path, data).warnings)
+    found = ec.identify(fitted, data).to_json()
+    (rz,) = (p["value"] for p in found["parameters"] if p["name"] == "base.rz")
+    assert rz == pytest.approx(np.radians(20), abs=0.01) and not found["warnings"]

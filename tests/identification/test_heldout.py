@@ -8,7 +8,7 @@ from support.cells import random_poses
 
 from elastocal.cell_tables import Nominal
 from elastocal.identification.identify import Options, identify
-from elastocal.identification.least_squares import held_out_residual, predicts_better
+from elastocal.identification.least_squares import held_out_residual, predicts_better, share_left
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 
@@ -29,17 +29,19 @@ def test_equals_refits_of_a_linear_model(size, weighted):
     """Allen's identity is exact: only rounding separates closed form and refits."""
     rng = np.random.default_rng(size)
     observations = 24 if size > 1 else 60
-    # unequal configurations, in no order
-    configuration = rng.integers(0, 8, observations)
+    configuration = rng.integers(0, 8, observations)  # unequal ones, in no order
     B = rng.normal(size=(observations * size, 7)) * 10.0 ** rng.uniform(-3, 3, 7)
     y = rng.normal(size=len(B))
     weights = weights_of(size, observations, 1) if weighted else UNIT
     x = np.linalg.lstsq(weights.apply(B), weights.apply(y), rcond=None)[0]
     held = held_out_residual(B, y - B @ x, weights, configuration, size)
-    rows = np.repeat(configuration, size)
+    rows, W = np.repeat(configuration, size), weights.apply(B)
+    left = share_left(np.linalg.qr(W)[0], rows)
     for c in np.unique(configuration):
-        # Noise is correlated within observations only, so leaving rows out leaves the rest.
-        rest = rows != c
+        rest = rows != c  # noise is correlated within observations only
+        with_c, without = (np.linalg.qr(some, mode="r") for some in (W, W[rest]))
+        ratio = [((W[~rest] @ np.linalg.inv(R)) ** 2).sum(axis=1) for R in (with_c, without)]
+        np.testing.assert_allclose(left[~rest], ratio[0] / ratio[1], rtol=1e-6)
         x_c = np.linalg.lstsq(weights.apply(B)[rest], weights.apply(y)[rest], rcond=None)[0]
         np.testing.assert_allclose(held[~rest], (y - B @ x_c)[~rest], rtol=1e-9, atol=1e-10)
 

@@ -65,8 +65,7 @@ def test_a_prior_is_the_ridge_of_the_linear_arm():
     assert list(found.prior_share) == list(alone.determined)
     np.testing.assert_allclose(list(found.prior_share.values()), share, atol=1e-8)
     for n, std, s in zip(found.determined, np.sqrt(np.diag(V)), share, strict=True):
-        e = found[n]
-        dof = alone.dof / (1 - s) ** 2
+        e, dof = found[n], alone.dof / (1 - s) ** 2
         assert e.dof == pytest.approx(dof, rel=1e-5)
         assert e.ci95[1] - e.value == pytest.approx(stats.t.ppf(0.975, dof) * std, rel=1e-5)
 
@@ -108,8 +107,7 @@ def test_an_equality_is_the_fit_in_fewer_parameters():
     at = model.regressor(table, model.nominal, columns, found.observations)
     T = np.delete(np.eye(5), 1, axis=1)
     T[1, 0] = 1.0
-    start = model.nominal[columns]
-    B, y = at.B @ T, at.residual + at.B @ start
+    B, y = at.B @ T, at.residual + at.B @ model.nominal[columns]
     z = np.linalg.solve(B.T @ B, B.T @ y)
     np.testing.assert_allclose(found.x[columns], T @ z, rtol=1e-8)
     e = y - B @ z
@@ -118,6 +116,8 @@ def test_an_equality_is_the_fit_in_fewer_parameters():
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-6, atol=1e-24)
     assert found.dof == len(y) - 4
     assert found.sigma == pytest.approx(np.sqrt(e @ e / found.dof), rel=1e-9)
+    told = found.finding("knowledge_contradicted").numbers["F"]
+    assert told == pytest.approx(e @ e / free.sigma**2 - free.dof) and not found.verdict.trusted
 
 
 # --- the file ---------------------------------------------------------------------------------

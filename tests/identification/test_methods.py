@@ -192,8 +192,7 @@ def test_a_marker_that_is_read_aside_is_one_finding():
     plan = table_at(random_poses(model.chain, 60, 0), markers=tuple(markers))
     table = measured(model, plan, true_values(model, rng), SIGMA, rng)
     aside = shifted(table, table.marker == 1, [0.0, 1.2 * SIGMA, 0.0])
-    report = identify(model, aside, Options(faulty="keep", noise="axis")).faulty_report
-    (found,) = report.findings
+    (found,) = identify(model, aside, Options(faulty="keep", noise="axis")).faulty_report.findings
     assert (found.level, found.name, len(found.lines)) == ("marker", "M2", 60)
 
 

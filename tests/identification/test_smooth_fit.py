@@ -80,8 +80,7 @@ def test_held_out_residuals_are_those_of_refits():
     """Leaving out a configuration for good: prior and noise as found, on the model itself."""
     model, rng = arm(*(e for e in EFFECTS if e != "joint_offset")), np.random.default_rng(0)
     table = readings(model, true(model, rng), 40, rng)
-    options = Options(method="ols", faulty="keep")
-    fit = identify(model, table, options)
+    fit = identify(model, table, Options(method="ols", faulty="keep"))
     observed = observe(table, model.observe)
     columns = np.array([model.names.index(name) for name in fit.determined])
     prior = np.zeros(len(columns))

@@ -88,8 +88,7 @@ def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path, 
     files = tmp_path / "unloaded.csv", tmp_path / "full_2600N.csv"
     done = run(*files, "--preset", "wide", "-o", tmp_path / "data.csv")
     assert done.exit_code == 0, done.output
-    rows = table(tmp_path / "data.csv")
-    assert {float(row["force_z_N"]) for row in rows} == {0.0, -2600.0}
+    assert {float(row["force_z_N"]) for row in table(tmp_path / "data.csv")} == {0.0, -2600.0}
     done = run(tmp_path / "loaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
     assert "named for a load that is not taken" in done.output
     done = run(tmp_path / "unloaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")

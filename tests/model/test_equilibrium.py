@@ -158,5 +158,4 @@ def test_a_load_without_equilibrium_is_nan_and_named() -> None:
     message = rf"table, line {first}: no static equilibrium .*\({lost.sum()} rows\)"
     with pytest.raises(ElastocalError, match=message):
         model.regressor(table)
-    kept = model.regressor(table.take(~lost))
-    assert np.isfinite(kept.B).all()
+    assert np.isfinite(model.regressor(table.take(~lost)).B).all()

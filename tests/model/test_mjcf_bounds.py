@@ -72,8 +72,7 @@ def test_what_an_arm_needs_is_read(tmp_path: Path) -> None:
     (tmp_path / "more.xml").write_text(f"<mujoco><worldbody>{BODY}</worldbody></mujoco>")
     top = '<size memory="1G" nuser_body="3" nkey="2"/><include file="more.xml"/>'
     top += '<asset><hfield name="h" nrow="100" ncol="100" size="1 1 1 1"/></asset>'
-    path = model(tmp_path, nested(2, 10), top)
-    assert read_mjcf(path, flange="end").n_joints == 4
+    assert read_mjcf(model(tmp_path, nested(2, 10), top), flange="end").n_joints == 4
 
 
 def test_attached_models_count_as_often_as_they_are_attached(tmp_path: Path) -> None:

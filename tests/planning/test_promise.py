@@ -117,8 +117,7 @@ def test_an_arm_that_does_not_come_back_to_quite_the_same_place() -> None:
     cell = plan_cell(loads=DOWN[None], poses=15, repeats=2, repeatability=40e-6)
     plan = plan_of(cell)
     truth = plan.model.nominal
-    tables = campaigns(plan, truth, 200)
-    found = identified(plan, tables, noise="axis+configuration")
+    found = identified(plan, campaigns(plan, truth, 200), noise="axis+configuration")
     check_promise(plan, found, truth)
     # Who does not count with it is promised far more than is kept.
     blind = replace(plan.model.cell, design=replace(plan.model.cell.design, repeatability=0.0))

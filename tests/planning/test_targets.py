@@ -28,8 +28,7 @@ LEVELS = tuple(np.unique(TABLE_2[:, 1]).tolist())
 
 
 def rows_at(cell: Cell, targets: TargetPoses, x: NDArray, chain: Chain = CHAIN) -> NDArray:
-    model = Model.assembled(chain, cell)
-    return prediction_rows(model, targets, x)
+    return prediction_rows(Model.assembled(chain, cell), targets, x)
 
 
 def somewhere(model: Model, seed: int = 0) -> NDArray:

@@ -103,8 +103,7 @@ def test_every_figure_is_drawn_without_complaint_or_request(
     opened: dict[str, Opened], kind: str
 ) -> None:
     found, page = opened[kind], opened[kind].page
-    mild = [text for text in found.complaints if "willReadFrequently" not in text]
-    assert mild == []
+    assert [text for text in found.complaints if "willReadFrequently" not in text] == []
     assert [url for url in found.requests if not url.startswith("blob:")] == [found.file.as_uri()]
     assert found.file.stat().st_size < 6e6
     boxes = page.evaluate(

@@ -103,8 +103,7 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
 def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doubted) -> None:
     """Twenty readings may be 1.38 times worse by chance (1 %), five 1.74 times."""
     known = replace(fine, dof=600, test=TestErrors(ratio * fine.heldout_rms, 0.0, 0.0, n))
-    found = judgement(known)
-    assert ("larger than chance explains" in found.sentence) == doubted
+    assert ("larger than chance explains" in judgement(known).sentence) == doubted
     assert any("Compare the test poses" in step for step in steps(known)) == doubted
 
 

@@ -84,8 +84,7 @@ def test_a_drift_is_correlated_in_time_and_the_table_says_when():
     tables = [simulate(model, plan, truth, k) for k in range(200)]
     off = np.array([t.position - exact.position for t in tables])
     assert abs(np.sqrt(np.mean(off**2)) / 1e-4 - 1) < 0.1
-    time = tables[0].time
-    assert (np.diff(time) == 30.0).all()  # what a visit takes
+    assert (np.diff(tables[0].time) == 30.0).all()  # what a visit takes
     neighbours = np.mean(off[:, 1:] * off[:, :-1]) / np.mean(off**2)
     assert abs(neighbours - np.exp(-0.5)) < 0.1
 

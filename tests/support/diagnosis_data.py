@@ -80,8 +80,7 @@ def cell(
         rotation_sigma=5e-5, distance_sigma=sigma,
     )  # fmt: skip
     spec = ModelSpec(observe=observe, effects=choices(effects), **model)
-    tool = Tool(LOAD_POINT, dict(MARKERS))
-    return Cell("arm", None, Robot(urdf=KR270), tool, tracker, spec)
+    return Cell("arm", None, Robot(urdf=KR270), Tool(LOAD_POINT, dict(MARKERS)), tracker, spec)
 
 
 def measured(

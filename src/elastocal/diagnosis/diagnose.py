@@ -64,7 +64,13 @@ from elastocal.identification.mistakes import (
 )
 from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty, named_runs
 from elastocal.identification.scrutiny import BudgetStep, autocorrelation
-from elastocal.identification.start import check_table, fallen, solved_body, without_copies
+from elastocal.identification.start import (
+    check_table,
+    fallen,
+    solved_body,
+    turned_base,
+    without_copies,
+)
 from elastocal.measurements import Measurements, order_contradicted, past_midnight
 from elastocal.messages import (
     ElastocalError,
@@ -286,6 +292,7 @@ def _diagnosed(
         warnings=(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
+            *filter(None, [turned_base(base.model, base.observed, base.residual)]),
             *warnings(dataset, found, suspects, answers["noise"]),
             *confirm(unheard_of(answers["effects"], base.model)),
         ),
@@ -455,5 +462,4 @@ def _searched(
             progress("searching again without outliers")
             found = search_without(faulty)
     total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
-    few = FewAnswer(dataset.without(faulty), found.dataset, total, (), rng, {}, found)
-    return few, suspects
+    return FewAnswer(dataset.without(faulty), found.dataset, total, (), rng, {}, found), suspects

@@ -69,7 +69,7 @@ def judged(
     `whole` table those findings stay that only these can tell."""
     of_solution = list(result.findings)
     if solution is not None and whole is not None:
-        of_solution = [*_conditioning(result, solution), *_exchanged(result, whole)]
+        of_solution += [*_conditioning(result, solution), *_exchanged(result, whole)]
     found = tuple(_found(result, of_solution))
     poor, care = (tuple(f.kind for f in found if f.severity == s) for s in ("poor", "care"))
     say, doing = (_poor if poor else _care, "") if poor or care else (_good, None)
@@ -90,7 +90,8 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
         yield _poor("not_converged", reason=result.reason)
     if nominal <= held < math.inf and not only_placed(result):
         yield _poor("no_better_than_nominal", heldout_rms_um=held, nominal_rms_um=nominal)
-    yield from (f for f in of_solution if f.kind == "exchanged_markers")
+    first = ("knowledge_contradicted", "exchanged_markers")
+    yield from (f for f in of_solution if f.kind in first)
     yield from mistakes.impossible_values(result)
     yield from far
     if copies := result.copies:
@@ -216,6 +217,7 @@ def _named(result: Calibration) -> list[str]:
 def _state_noise(result: Calibration) -> str:
     keys, ask = "sigma_um, or range_um and transverse_um", "elastocal diagnose looks for that"
     keys = "distance_um" if result.model.observe == "distance" else keys
+    keys = f"{keys}, and rotation_urad" if result.model.observe == "pose" else keys
     return (
         f"State the tracker's noise ([tracker] {keys}): only beside it does the residual say "
         f"whether the model lacks something.{'' if _named(result) else f' {ask} either way.'}"
@@ -551,6 +553,9 @@ SENTENCES = {
     "standard deviations.",
     **dict.fromkeys(("load_unit", "exchanged_markers", "scatter_not_counted"), "{remedy}"),
     "not_converged": "The fit did not converge: {reason}. {remedy}",
+    "knowledge_contradicted": "The readings contradict {stated}: without, they are fitted better "
+    "than noise explains (F = {F:.1f} on {dof_stated} and {dof_readings:.0f} degrees of freedom, "
+    "{p}). {remedy}",
     "few_degrees_of_freedom": "Only {dof} degrees of freedom for {parameters} determined "
     "parameters: intervals are wide and the residual is too small. {remedy}",
     "not_held_out": "Some configuration alone determines a parameter, so there is no held-out "

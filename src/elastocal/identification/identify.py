@@ -43,7 +43,7 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     predicted_error,
 )
-from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
+from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors, made
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.solve import (
     Course,
@@ -69,6 +69,7 @@ from elastocal.identification.start import (
     ordinary,
     solved_body,
     start_values,
+    turned_base,
     without_copies,
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
@@ -123,9 +124,10 @@ def identify(
     found = run_method(course)
     progress("intervals and held-out residuals")
     result = summarise(course, found, new_poses, copies, test)
-    body = solved_body(table, float(found.solution.fit.residual.std()))
+    left = found.solution.fit.residual
+    body = solved_body(table, float(left.std())), turned_base(model, observed, left)
     told = (*told, *_doubts(model, table, test, result.x))
-    return replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
+    return replace(result, warnings=(*told, *result.warnings, *filter(None, body)))
 
 
 def _doubts(
@@ -280,10 +282,10 @@ def summarise(
     pairs = ((determined[a], determined[b], float(rho[a, b])) for a, b in zip(i, j, strict=True))
     faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
-    heldout, leverage = solution.crossed
+    heldout, leverage, _ = solution.crossed
     there = np.isfinite(heldout)  # under a drift one that is not would reach all
     plainly_large = problem.large and solution.held is None
-    report = None
+    report, stated = None, found.contradicted
     if not every.exact:
         fitted = found.solution if set_apart or found.smooth else course.sound
         report = report_faulty(every, fitted, found.noise, found.good, found.standard)
@@ -305,6 +307,7 @@ def summarise(
         faulty_report=report, active=found.active, prior_share=found.prior_share,
         smooth=found.smooth, left=left_open(own_sizes, found.limits), copies=copies,
         shown=_shown(solution, covariance),
+        findings=(made("care", "knowledge_contradicted", **stated),) if stated else (),
     )  # fmt: skip
     predicted = predicted_error(
         result.arm, observed, result.excess, found.spread,
@@ -337,9 +340,8 @@ def uncertainty_of(
     observed: Observations, B: Array, covariance: Array, left: Array | float = 1.0
 ) -> Array:
     """Standard deviation (configurations,) in m that the fit's own uncertainty gives a predicted
-    position, mean square over a configuration's readings; B (rows, determined).  A row that the fit
-    holds with leverage h is known with variance v there, with v/(1 − h) by the fit to the others;
-    `left` (rows,) are 1 − h."""
+    position, mean square over a configuration's readings; B (rows, determined).  By the fit to
+    other configurations a row's variance is 1/`left` (rows,) times as much."""
     B = (B.T / np.sqrt(left)).T.reshape(-1, observed.size, B.shape[1])
     each = variance_of(B[:, :3], covariance)
     code = numbered(observed.configuration)
@@ -359,14 +361,11 @@ def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatt
     return Scatter(found.matrix, found.dof) if found.dof.all() else None
 
 
-SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
-
-
 def _shown(solution: Solution, covariance: Array) -> ShownPoses | None:
     if solution.problem.large or not np.isfinite(covariance).all():
         return None
-    left = np.maximum(1 - solution.crossed[1], SEEN_BY_OTHERS)
-    std = uncertainty_of(solution.problem.observations, solution.fit.B, covariance, left)
+    observed, left = solution.problem.observations, solution.crossed[2]
+    std = uncertainty_of(observed, solution.fit.B, covariance, left)
     return ShownPoses(float(std.max()), len(std))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -28,8 +29,6 @@ from elastocal.messages import (
     option,
     quoted,
     require,
-    size_of,
-    some,
 )
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -264,33 +263,29 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     return replace(
         before, method="constrained", solution=final, spread=spread,
         active=found.best.active, prior_share=shares, effective=round(found.effective),
-        warnings=(*before.warnings, *doubts),
+        contradicted=doubts,
         smooth=tuple(part.refitted(final.fit.x, columns, spread.matrix) for part in before.smooth),
     )  # fmt: skip
 
 
-def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[str, ...]:
-    """A sentence where the objective grew by more than noise explains (F-test).  The stated prior's
-    `rows` and active constraints count as degrees of freedom, less the parameters they made
-    estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious."""
+def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> dict[str, Any]:
+    """What the readings contradict, where the objective grew by more than noise explains (F-test).
+    The stated prior's `rows` and active constraints count as degrees of freedom, less the
+    parameters they made estimable.  At active bounds the true distribution is smaller (χ̄²): the
+    test is cautious."""
     fit, own = before.solution.fit, before.solution.fit.known
     stated = rows + len(found.best.active) - (len(found.names) - len(fit.columns))
     if stated < 1:
-        return ()
+        return {}
     away = own.P @ fit.x[fit.columns] - own.target
     grown = found.objective - float(fit.whitened @ fit.whitened + away @ away)
     _, dof = before.beside or (0.0, max(float(before.spread.dof.min()), 1.0))
     F = max(grown, 0.0) / (stated * found.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
-    if p > CONTRADICTED:
-        return ()
-    what = [*["the prior"] * bool(rows), *(f"'{a.label}'" for a in found.best.active)]
-    return (
-        f"The readings contradict {some(what, 6, ' and ')}: without, they are fitted better than "
-        f"noise explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, {size_of(p)}). "
-        "Check names, units and signs of what is stated, and whether the model lacks an effect.",
-    )
+    what = (*["the prior"] * bool(rows), *(f"'{a.label}'" for a in found.best.active))
+    found_so = {"stated": what, "F": F, "dof_stated": stated, "dof_readings": dof, "p": p}
+    return found_so if p <= CONTRADICTED else {}
 
 
 def _reduction(solution: Solution, found: KnownFit) -> Reduction:

@@ -13,7 +13,7 @@ from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import Problem, Weights, same_size
 from elastocal.measurements import numbered
-from elastocal.messages import InputError, InsufficientDataError
+from elastocal.messages import EXACT, InputError, InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
 
 LEVEL = 0.95
@@ -263,6 +263,9 @@ def clustered(
     return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
 
 
+SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
+
+
 def adjusted_rows(Qc: Array, power: float) -> tuple[Array, BoolArray]:
     """(I − Q_cQ_cᵀ)^power Q_c (k, size, p), and which of the k clusters determine a direction
     alone, along which it is zero.  The smaller side of g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) is
@@ -277,6 +280,9 @@ def adjusted_rows(Qc: Array, power: float) -> tuple[Array, BoolArray]:
     factor = np.where(single, 0.0, np.where(single, 1.0, 1 - values) ** power)
     A = (U * factor[:, None, :]) @ U.transpose(0, 2, 1)
     return (A @ Qc if by_row else Qc @ A), determined
+
+
+Crossed = tuple[Array, Array, Array]  # held-out residual, leverage, `share_left`, each (rows,)
 
 
 def held_out_residual(
@@ -307,12 +313,12 @@ def held_out_residual(
 
 def held_out_by_parts(
     problem: Problem, x: Array, columns: IntArray, half: Array, step: Array | None = None
-) -> tuple[Array, Array]:
-    """The same with the model linearised at x, a part at a time, and the leverage (rows,) of each.
+) -> Crossed:
+    """The same with the model linearised at x, a part at a time.
     `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
     the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
     step to the linear model's minimum, where x is not it."""
-    held, leverage = np.empty((2, len(problem.observations.value)))
+    held, leverage, left = np.empty((3, len(problem.observations.value)))
     together, size = problem.weights.together, problem.observations.size
 
     def leave_out(part: Problem) -> None:
@@ -326,9 +332,10 @@ def held_out_by_parts(
         labels = part.observations.configuration if together is None else together
         held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, size))
         leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
+        left[part.rows] = share_left(Q, np.repeat(part.observations.configuration, size))
 
     list(problem.each(leave_out))
-    return held, leverage
+    return held, leverage, left
 
 
 def growth(B: Array, Q: Array, e: Array, configuration: IntArray) -> Array:
@@ -360,6 +367,17 @@ def left_out(
         own = e[rows][..., None]
         moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)
         yield rows, np.asarray(moved[..., 0], dtype=np.float64), alone
+
+
+def share_left(Q: Array, configuration: IntArray) -> Array:
+    """Variance (rows,) of a row as the fit predicts it, over that by a fit to the configurations
+    besides its own: of Q_c Q_cᵀ over Q_c Q_cᵀ (I − Q_c Q_cᵀ)⁻¹, Q orthonormal as in `growth`."""
+    left = np.ones(len(Q))
+    for rows in same_size(configuration):
+        without, alone = adjusted_rows(Q[rows], -0.5)
+        here, grown = ((part**2).sum(axis=2) + EXACT for part in (Q[rows], without))
+        left[rows] = np.where(alone[:, None], SEEN_BY_OTHERS, here / grown)
+    return left
 
 
 def told_by_one(B: Array, configuration: IntArray) -> Array:

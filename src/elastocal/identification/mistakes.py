@@ -733,10 +733,14 @@ def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[F
     if others:
         told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
                 for p, off, _ in others]  # fmt: skip
+        last, loaded = f"link{result.model.chain.n_joints}", result.observations.table.force.any()
+        of_load = loaded and all(p.where == last and p.unit == "m" for p, *_ in others)
         compare = (
-            "The arm is not the one of the robot's file: compare its lengths and angles with the "
-            f"data sheet (off, and known to: {listed(told, 3)})."
-        )
+            "Check where the load acts ([tool] load_point_m) and the last link, which looks alike"
+            if of_load
+            else "The arm is not the one of the robot's file: compare its lengths and angles with "
+            "the data sheet"
+        ) + f" (off, and known to: {listed(told, 3)})."
         yield (_note if explained else _care)(
             "far_from_nominal" if explained else "unheard_of",
             compare if explained else lacking,

@@ -22,6 +22,7 @@ from elastocal.identification.least_squares import (
     f_test,
     held_out_residual,
     orthogonal,
+    share_left,
 )
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
@@ -649,12 +650,12 @@ def robust_result(
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
     root = np.sqrt(np.repeat(np.minimum(found.weights(found.c), 1e6), observed.size))
     own = sparse.eye_array(len(root)) if weights.whiten is None else weights.whiten
-    whiten = sparse.csr_array(sparse.diags_array(root) @ own)
-    heldout = held_out_residual(
-        fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
-    )
+    robust = replace(weights, whiten=sparse.csr_array(sparse.diags_array(root) @ own))
+    out, Q = observed.configuration, np.linalg.qr(robust.apply(fit.B))[0]
+    heldout = held_out_residual(fit.B, at.residual, robust, out, observed.size)
+    left = share_left(Q, np.repeat(out, observed.size))
     solution = replace(sound, fit=fit)
-    solution = replace(solution, held=(heldout, solution.crossed[1]))
+    solution = replace(solution, held=(heldout, solution.crossed[1], left))
     labels = np.array(observed.table.configuration_labels)
     cluster = None if intervals == "auto" else labels[observed.configuration]
     return MethodResult(method, solution, found.covariance(cluster), None, good)

@@ -235,6 +235,8 @@ def remedies() -> dict[str, str]:
         "(elastocal design plans them), or give it a prior.",
         "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
         "parameters.",
+        "knowledge_contradicted": "Check names, units and signs of what is stated, and whether the "
+        "model lacks an effect.",
         "many_faulty_readings": "Check where they lie before excluding any.",
         "new_poses_not_shown": f"{more_poses()} For a part of the joint ranges alone, state test "
         "poses in the cell.",

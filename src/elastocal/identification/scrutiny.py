@@ -224,10 +224,12 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
         CHOSEN: fitted,
         "all that readings tell apart": every,
     }
-    sets: dict[bytes, tuple[str, BoolArray]] = {}
+    sets: dict[bytes, tuple[str, BoolArray, Array]] = {}
     for name, own in named.items():
         if own.any() and (name == CHOSEN or own.tobytes() not in sets):
-            sets[own.tobytes()] = name, own
+            B = _by_itself(fit, np.flatnonzero(own))
+            if B.any(axis=0).all():  # a base turns no deflections of an arm that does not yield
+                sets[own.tobytes()] = name, own, B
     if len(sets) < 2:
         return ()
     moves = np.where(fitted & (stage > 0), fit.x - model.nominal, 0.0)
@@ -235,10 +237,9 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     e, target = weights.apply(fit.residual), weights.apply(y)
     s2 = float(e @ e) / max(fit.dof, 1)
     held, plain, likelihood = list[Array](), list[float](), list[float]()
-    for _, own in sets.values():
+    for _, own, B in sets.values():
         # Whole rows count by the fit's weights, whatever the set.
         columns = np.flatnonzero(own)
-        B = _by_itself(fit, columns)
         left, alone = _refitted(fit, y, B, weights)
         plain.append(rms_3d(left, size))
         held.append((alone.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
@@ -254,9 +255,9 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     squares = np.array([np.bincount(code, h) for h in held])
     drawn = _drawn_rms(squares, np.bincount(code), np.random.default_rng(0))
     rms = [float(np.sqrt(h.mean())) for h in held]
-    first = [name for name, _ in sets.values()].index(CHOSEN)
+    first = [name for name, *_ in sets.values()].index(CHOSEN)
     found = []
-    for k, (name, own) in enumerate(sets.values()):
+    for k, (name, own, _) in enumerate(sets.values()):
         over = drawn[k] - drawn[first] if np.isfinite(held[k]).all() else np.full(DRAWS, np.inf)
         low, high = (float(v) for v in np.quantile(over, [0.025, 0.975], method="nearest"))
         found.append(

@@ -21,7 +21,13 @@ from scipy import sparse, special
 
 from elastocal.engine import Products, climb
 from elastocal.identification.knowledge import share_of_prior
-from elastocal.identification.least_squares import ALONE, Covariance, held_out_by_parts, rms_3d
+from elastocal.identification.least_squares import (
+    ALONE,
+    Covariance,
+    Crossed,
+    held_out_by_parts,
+    rms_3d,
+)
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.outliers import FALSE_ALARM, FEW, drops, settle
@@ -352,10 +358,8 @@ class _Search:
         rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
         return LinearRows(RFactor(rows, factor.rows), f.std, f.group, len(f.groups))
 
-    def crossed(self, fit: JointFit, scales: Scales) -> tuple[Array, Array]:
-        """Residual (rows,) of each configuration under a fit to the others, in m or rad, infinite
-        where there is none, and leverage (rows,), by the model linearised with functions of these
-        `scales`."""
+    def crossed(self, fit: JointFit, scales: Scales) -> Crossed:
+        """In m or rad, infinite where there is none, with functions of these `scales`."""
         found, f, posterior = fit.found, self.functions, Posterior(fit.linear, scales)
         columns, x = np.append(fit.reduction.kept, f.columns[posterior.own]), found.x.copy()
         x[f.columns] = f.nominal
@@ -434,7 +438,7 @@ class _Search:
         self.alike[suspects[alike.any(axis=1)]] = True
         return good | self.alike
 
-    def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, tuple[Array, Array]]:
+    def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, Crossed]:
         """Without the functions that the readings do not show, or that predict held-out
         configurations worse than none; the least supported is tried first."""
         size, scales, cross = self.observed.size, fit.scales, self.crossed(fit, fit.scales)
@@ -456,7 +460,7 @@ class _Search:
         return fit, self.crossed(fit, fit.scales)
 
     def result(
-        self, fit: JointFit, cross: tuple[Array, Array], noise: NoiseFit | None, good: BoolArray
+        self, fit: JointFit, cross: Crossed, noise: NoiseFit | None, good: BoolArray
     ) -> MethodResult:
         posterior, f, r, found = fit.posterior, self.functions, fit.reduction, fit.found
         columns, model, k = found.columns, self.model, len(r.kept)

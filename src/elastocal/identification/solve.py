@@ -19,6 +19,7 @@ from elastocal.identification.least_squares import (
     EPS,
     LEVEL,
     Covariance,
+    Crossed,
     as_of_another_campaign,
     drawing_root,
     f_test,
@@ -219,17 +220,16 @@ def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60)
     return fit(problem, chosen.kept, problem.x0, max_steps=max_steps)
 
 
-def looked_at(found: Fit) -> tuple[Array, Array]:
-    """Residual (rows,) of each configuration under a fit to the others, under a drift of each block
-    in time, as far off as readings of another day are; and leverage (rows,) in the fit."""
+def looked_at(found: Fit) -> Crossed:
+    """Under a drift each block in time is left out, as far off as readings of another day are."""
     problem, observed, weights = found.problem, found.problem.observations, found.problem.weights
-    held, leverage = held_out_by_parts(problem, found.x, found.columns, found.r_factor.half)
+    held, *other = held_out_by_parts(problem, found.x, found.columns, found.r_factor.half)
     if weights.together is not None:
         held = held_out_residual(
             found.B, found.residual, weights, observed.configuration, observed.size
         )
         held = held * as_of_another_campaign(found.B, weights, observed.size)
-    return held, leverage
+    return held, other[0], other[1]
 
 
 def fits_better(narrow: RFactor, wide: RFactor) -> bool:
@@ -297,7 +297,7 @@ class Solution:
     fit: Fit
     reduction: Reduction
     nominal_rms: float
-    held: tuple[Array, Array] | None = None
+    held: Crossed | None = None
 
     @property
     def problem(self) -> Problem:
@@ -309,8 +309,8 @@ class Solution:
         return rms_3d(self.fit.residual, self.problem.observations.size) < EXACT
 
     @cached_property
-    def crossed(self) -> tuple[Array, Array]:
-        """Residual (rows,) of each configuration under a fit to the others, and leverage (rows,).
+    def crossed(self) -> Crossed:
+        """What `looked_at` finds.
 
         Where that fit leaves a direction open by more than FAR, it has typical deviations of what
         is kept, and of what that stands for, beside it: no arm that works is off by as much.
@@ -319,9 +319,9 @@ class Solution:
         """
         if self.held is not None:
             return self.held
-        held, leverage = looked_at(self.fit)
+        held, leverage, left = looked_at(self.fit)
         if self.problem.large:
-            return held, leverage
+            return held, leverage, left
         fit, kept, sizes = self.fit, self.reduction.kept, self.problem.sizes
         weights, observed = self.problem.weights, self.problem.observations
         shares = self.reduction.mixing * sizes[self.reduction.dropped]
@@ -343,7 +343,7 @@ class Solution:
             open_ = variance * np.linalg.eigvalsh(V[:p, :p])[-1] > FAR**2 / (1 + FAR**2)
             if open_ and np.isfinite(held[at]).all():
                 held[at] = fit.residual[at] - B[at] @ (V @ (z - rows[at].T @ e[at]))[:p]
-        return held, leverage
+        return held, leverage, left
 
 
 def solve(
@@ -674,11 +674,11 @@ class MethodResult:
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
     fit. What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
-    many parameters the readings paid for (`effective`; None: all fitted), and `warnings` where the
-    readings contradict them.  `smooth` are the smooth functions, `beside` which σ of a whitened row
-    and its degrees of freedom were found, and `standard` (N, size) the residuals of all readings
-    free of the fit's part in them.  `limits` are the 95 % intervals of the parameters that the
-    readings hardly show, by their index.
+    many parameters the readings paid for (`effective`; None: all fitted), and what of them is
+    `contradicted`.  `smooth` are the smooth functions, `beside` which σ of a whitened row and its
+    degrees of freedom were found, and `standard` (N, size) the residuals of all readings free of
+    the fit's part in them.  `limits` are the 95 % intervals of the parameters that the readings
+    hardly show, by their index.
     """
 
     method: str
@@ -690,6 +690,7 @@ class MethodResult:
     prior_share: dict[str, float] = field(default_factory=dict)
     effective: int | None = None
     warnings: tuple[str, ...] = ()
+    contradicted: dict[str, Any] = field(default_factory=dict)
     smooth: tuple[SmoothPart, ...] = ()
     beside: tuple[float, float] | None = None
     standard: Array | None = None

@@ -33,7 +33,7 @@ from elastocal.model.effects.geometry import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import rotation_from_vector, vector_from_rotation
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray, IntArray, rpy_from_rotation
 
 IntervalKind = Literal[
     "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
@@ -524,6 +524,7 @@ def _unit_of(
     return next(near, None) if found.left[0] < ALIKE * reach else None
 
 
+FITS = 0.03  # m, which nominal arms keep to the positions of their readings
 FAR_OFF = 10.0  # times the median, which is more than any noise is
 
 
@@ -533,7 +534,11 @@ def nothing_shown(observed: Observations, residual: Array) -> InsufficientDataEr
     far = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
     told = "the readings do not depend on any parameter of the model; measure other poses or loads,"
     told += " or choose other effects"
-    if far.max() > FAR_OFF * np.median(far):
+    if (off := float(np.median(far))) > FITS:
+        told = f"no parameter shows beside readings that lie {length(off)} (median) from the model "
+        told += f"as it is held: check {option('fixed')} and [model.nominal] base_position_m, or "
+        told += "fit base_frame and marker_position"
+    elif far.max() > FAR_OFF * off:
         line = observed.table.row[observed.lead[far.argmax()]]
         told = f"no parameter shows beside the reading of line {line}, which is "
         told += f"{length(far.max())} off: correct it, or drop it"
@@ -756,6 +761,28 @@ class Fallen:
             f"{text}. If it is mounted as stated, {self.axis} of that frame points up: write the "
             f"columns {', '.join(self.columns)} as x, y, z; else state [model.nominal] base_rpy_deg"
         )
+
+
+def turned_base(model: Model, observed: Observations, residual: Array) -> str | None:
+    """That the positions show the base turned, by an angle that moves deflections by more than
+    their `residual` (rows,) m, where the cell alone says how it stands."""
+    table, stated = observed.table, model.cell.model.nominal.base_rotation
+    placed = any(p.effect == BaseFrame.name for p in model.parameters)
+    if model.observe != "deflection" or table.position is None or placed:
+        return None
+    light = table.take(np.flatnonzero(~table.force.any(axis=1)))
+    if len(np.unique(light.q, axis=0)) < FEWEST_VISITS:
+        return None
+    Rotation, found = scipy.spatial.transform.Rotation, Registration.of(model, light)
+    off = Rotation.from_matrix(found.rotation.T @ (np.eye(3) if stated is None else stated))
+    if found.error > FITS or off.magnitude() * observed.value.std() < residual.std():
+        return None
+    rpy = [rounded(v, 4) for v in np.degrees(rpy_from_rotation(found.rotation))]
+    return (
+        f"the positions show the base turned by {np.degrees(off.magnitude()):.1f}° from how the "
+        "cell mounts it, so that deflections and loads count along wrong axes: state "
+        f"[model.nominal] base_rpy_deg = [{', '.join(rpy)}], or fit base_frame"
+    )
 
 
 def fallen(model: Model, x: Array) -> Fallen | None:

@@ -70,6 +70,7 @@ def _doubt(f: Finding) -> str:
 
 DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "not_converged": "the fit did not converge ({reason})",
+    "knowledge_contradicted": "the readings contradict {stated}",
     "no_better_than_nominal": "the held-out error ({heldout_rms_um} rms) is not below that of the "
     "nominal arm ({nominal_rms_um})",
     "not_held_out": lambda f: (
