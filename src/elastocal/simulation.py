@@ -232,7 +232,8 @@ def _read(
     if kind == "none":
         return exact
     covariance, _ = position_covariance(exact, model.cell.tracker, kind)
-    shake = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), _standard(model, rng, (n, 3)))
+    drawn = _standard(model, rng, (n, 3))
+    shake = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), drawn)
     return replace(exact, position=position + shake)
 
 
@@ -300,7 +301,8 @@ def _copy_example(folder: Path) -> None:
 def reading_sigma(folder: Path) -> np.ndarray:
     """Standard deviation (configurations, 3) in m of one reading, from Table 1."""
     table = _table(folder, "table1_noise.csv")
-    return np.column_stack([table[f"sigma_{a}_um"] for a in "xyz"]) * 1e-6 / np.sqrt(2)
+    deflection = np.column_stack([table[f"sigma_{a}_um"] for a in "xyz"])
+    return deflection * 1e-6 / np.sqrt(2)
 
 
 def published_compliances(folder: Path) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:

@@ -195,7 +195,8 @@ def prior_deviations(base: Baseline) -> Array:
     columns costs v²/4w² less than v in one."""
     compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
     wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
-    return np.where(is_placed(base.model), PLACED, np.maximum(wide, np.abs(from_centre(base))))
+    wide = np.maximum(wide, np.abs(from_centre(base)))
+    return np.where(is_placed(base.model), PLACED, wide)
 
 
 # Evidence grows with the readings, and an effect worth finding has hundreds of nats in so many.

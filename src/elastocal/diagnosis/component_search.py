@@ -325,7 +325,8 @@ def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[C
     here = {c.effect.name for c in found.components}
     hidden = [c for c in found.away(components) if c.effect.name in here and c.fellows > 1]
     sizes = [np.full((1, c.width), np.exp(size_of_fellows(found, c))) for c in hidden]
-    pairs = zip(evidence_beside(found, hidden, np.ones(1), sizes), hidden, strict=True)
+    each = evidence_beside(found, hidden, np.ones(1), sizes)
+    pairs = zip(each, hidden, strict=True)
     return tuple(c for e, c in pairs if expit(e + log_odds(found.components, c)) > CHANCE)
 
 

@@ -367,7 +367,8 @@ BUNDLE = 200
 
 
 def bundles(columns: Sequence[Array]) -> Iterator[Sequence[Array]]:
-    at = np.flatnonzero(np.diff(np.cumsum([0, *(c.shape[2] for c in columns)]) // BUNDLE)) + 1
+    ends = np.cumsum([0, *(c.shape[2] for c in columns)]) // BUNDLE
+    at = np.flatnonzero(np.diff(ends)) + 1
     yield from (columns[a:b] for a, b in pairwise([0, *at, len(columns)]) if b > a)
 
 
@@ -518,7 +519,8 @@ def _noise_beside(problem: SumOfComponents, at: Sizes) -> NoiseValues:
     wide = some.with_columns(joined, np.ones(joined.shape[2]))
     # From next to nothing the likelihood is flat in a joint's logarithm, and no climb leaves.
     usual = NoiseValues.usual(len(noise.joint)).joint
-    found = fit_noise(wide, replace(noise, joint=np.maximum(noise.joint, FLAT * usual)), ENOUGH)
+    start = replace(noise, joint=np.maximum(noise.joint, FLAT * usual))
+    found = fit_noise(wide, start, ENOUGH)
     if data.stated or (found.joint > STANDS_OUT * usual).any():
         return found
     # Nor from there where nothing is stated and the instrument has taken the joints' scatter.

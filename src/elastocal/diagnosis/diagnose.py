@@ -462,4 +462,5 @@ def _searched(
             progress("searching again without outliers")
             found = search_without(faulty)
     total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
-    return FewAnswer(dataset.without(faulty), found.dataset, total, (), rng, {}, found), suspects
+    few = FewAnswer(dataset.without(faulty), found.dataset, total, (), rng, {}, found)
+    return few, suspects
