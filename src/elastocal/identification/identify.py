@@ -362,9 +362,9 @@ def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatt
 
 
 def _shown(solution: Solution, covariance: Array) -> ShownPoses | None:
-    if solution.problem.large or not np.isfinite(covariance).all():
-        return None
     observed, left = solution.problem.observations, solution.crossed[2]
+    if solution.problem.large or not np.isfinite(covariance).all() or not left.all():
+        return None
     std = uncertainty_of(observed, solution.fit.B, covariance, left)
     return ShownPoses(float(std.max()), len(std))
 

@@ -263,9 +263,6 @@ def clustered(
     return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
 
 
-SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
-
-
 def adjusted_rows(Qc: Array, power: float) -> tuple[Array, BoolArray]:
     """(I − Q_cQ_cᵀ)^power Q_c (k, size, p), and which of the k clusters determine a direction
     alone, along which it is zero.  The smaller side of g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) is
@@ -371,12 +368,13 @@ def left_out(
 
 def share_left(Q: Array, configuration: IntArray) -> Array:
     """Variance (rows,) of a row as the fit predicts it, over that by a fit to the configurations
-    besides its own: of Q_c Q_cᵀ over Q_c Q_cᵀ (I − Q_c Q_cᵀ)⁻¹, Q orthonormal as in `growth`."""
+    besides its own: of Q_c Q_cᵀ over Q_c Q_cᵀ (I − Q_c Q_cᵀ)⁻¹, Q orthonormal as in `growth`; none
+    where its configuration alone tells a direction."""
     left = np.ones(len(Q))
     for rows in same_size(configuration):
         without, alone = adjusted_rows(Q[rows], -0.5)
         here, grown = ((part**2).sum(axis=2) + EXACT for part in (Q[rows], without))
-        left[rows] = np.where(alone[:, None], SEEN_BY_OTHERS, here / grown)
+        left[rows] = np.where(alone[:, None], 0.0, here / grown)
     return left
 
 

@@ -159,7 +159,7 @@ class TestErrors:
     Of the fit's own uncertainty there `std` is the rms in m, `most_fitted` the largest of any
     configuration fitted, predicted from the others; so many of the test `configurations` lie
     beyond it (`far`), as they would by chance with probability `p_far`.  NaN and 1 where the table
-    is too large to say.  `errors` (n,) are all of them.
+    is too large to say, or one configuration alone tells a parameter.  `errors` (n,) are all.
     """
 
     __test__ = False  # not a pytest class
