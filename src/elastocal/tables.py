@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from io import BytesIO, StringIO
 from itertools import chain
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import BinaryIO, TextIO
 
 import numpy as np
 
@@ -47,6 +47,7 @@ UTF16 = (b"\xff\xfe", b"\xfe\xff")
 ARCHIVE = b"PK\x03\x04"
 SAYS_NOTHING = re.compile(r"""\ufeff?[ \t,;"]*(#.*)?""")  # a comment, or cells that are empty
 NOT_FINITE = re.compile(r"[+-]?(nan|na|n/a|null|none|inf|infinity|#n/?a|#num!)", re.IGNORECASE)
+ORDINARY = re.compile(r"[0-9.eE+ -]*")  # what numbers are made of that need no second look
 THOUSANDS = re.compile(r"[+-]?[0-9]+([.,' ][0-9]{3})*[.,][0-9]+")
 
 Row = tuple[int, list[str]]  # number of the line, its cells
@@ -453,20 +454,18 @@ def _read(
         found += [number for number, _ in some]
         told = f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
         require(len(found) <= MAX_ROWS, told)
-        lines = [line for _, line in some]
-        plain = None if commas else _plain(lines, len(header), numbers, labels)
-        if plain is None:
-            rows = _split_all(source, some, len(header), delimiter)
+        rows = _split_all(source, some, len(header), delimiter)
+        values = None if commas else _ordinary([cells[i] for _, cells in rows for i in numbers])
+        if values is None:
             for _, cells in rows:
                 for i in numbers:  # labels stay as they are written
                     cells[i] = plain_minus(cells[i])
             if problem := first_bad_cell(source, rows, numbers, commas, blanks, marks, noun):
                 raise problem
-            bare = ([c[i].replace(",", ".").strip() or "nan" for i in numbers] for _, c in rows)
-            values = np.array([list(map(float, own)) for own in bare]).reshape(len(rows), -1)
-            texts = np.array([[cells[i] for i in labels] for _, cells in rows], dtype=object)
-            plain = values, texts.reshape(len(rows), -1)
-        read.append(plain)
+            bare = (c[i].replace(",", ".").strip() or "nan" for _, c in rows for i in numbers)
+            values = np.array(list(map(float, bare)))
+        texts = np.array([[cells[i] for i in labels] for _, cells in rows], dtype=object)
+        read.append((values.reshape(len(rows), -1), texts.reshape(len(rows), -1)))
     require(found, f"{source}: has a header but no rows; add them below it")
     values, texts = map(np.concatenate, zip(*read, strict=True))
     return RawTable(
@@ -476,22 +475,13 @@ def _read(
     )  # fmt: skip
 
 
-def _plain(
-    lines: list[str], width: int, numbers: Iterable[int], labels: Iterable[int]
-) -> tuple[Array, np.ndarray] | None:
-    """The columns of lines without quotation marks and with plain numbers, in a tenth of the time
-    that it takes cell by cell; None of others."""
-    if any(line.count(",") != width - 1 or '"' in line for line in lines):
-        return None
-    options: Any = dict(delimiter=",", comments=None, ndmin=2)
-    empty = np.empty((len(lines), 0))
+def _ordinary(cells: list[str]) -> Array | None:
+    """Plain numbers, in a tenth of the time that it takes cell by cell; None of others."""
     try:
-        values, texts = (np.loadtxt(lines, kind, usecols=[*at], **options) if at else empty
-                         for kind, at in ((np.float64, numbers), (object, labels)))  # fmt: skip
+        values = np.array(list(map(float, cells)))
     except ValueError:
         return None
-    whole = len(values) == len(texts) == len(lines)  # an empty line is passed over
-    return (values, texts) if whole and np.isfinite(values).all() else None
+    return values if ORDINARY.fullmatch("".join(cells)) and np.isfinite(values).all() else None
 
 
 def _parquet(source: str, what: str) -> str:
