@@ -506,11 +506,7 @@ def _parquet(source: str, what: str) -> str:
         except Exception as error:  # it has exceptions of its own
             raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
     frame = frame.reset_index() if any(frame.index.names) else frame
-    cells, text = frame.astype(object).where(frame.notna(), ""), StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(frame.columns)
-    writer.writerows(cells.itertuples(index=False, name=None))
-    return text.getvalue()
+    return str(frame.to_csv(index=False, lineterminator="\n"))
 
 
 def write_csv(
