@@ -582,7 +582,7 @@ WIDE = 90  # characters of a list on one line
 def toml_value(value: Any) -> str:
     import tomlkit  # slow to load, seldom asked for
 
-    return _folded(tomlkit.item(value)).as_string()
+    return str(folded(tomlkit.item(value)).as_string())
 
 
 def toml_key(name: str) -> str:
@@ -591,39 +591,22 @@ def toml_key(name: str) -> str:
     return str(tomlkit.key(name).as_string())
 
 
-def rewritten_toml(text: str, data: dict[str, Any]) -> str:
-    """The TOML `text` made to say `data`: lines that say the same stay, with the comments around
-    them; what is new joins its table, or follows in one of its own."""
+def rewritten_toml(text: str, change: Callable[[Any], None]) -> str:
+    """The TOML `text` after a `change` of what it says, which is made in place: all other lines
+    stay, with the comments around them."""
     import tomlkit
 
-    document = tomlkit.parse(text)
+    data, document = tomllib.loads(text), tomlkit.parse(text)
+    change(data)
     with suppress(tomlkit.exceptions.TOMLKitError, ValueError):
-        _say(document, data)
+        change(document)
         if tomllib.loads(found := tomlkit.dumps(document)) == data:
             return found
     return tomlkit.dumps(data)
 
 
-def _folded(item: Any) -> Any:
-    if isinstance(item, list) and len(item.as_string()) > WIDE:  # type: ignore[attr-defined]
+def folded(item: Any) -> Any:
+    """A list of a document, over several lines where it is long."""
+    if isinstance(item, list) and len(getattr(item, "as_string", str)()) > WIDE:
         item.multiline(True)  # type: ignore[attr-defined]
     return item
-
-
-def _say(there: Any, data: Mapping[str, Any]) -> None:
-    for name in [name for name in there if name not in data]:
-        del there[name]
-    for name, value in data.items():
-        known = there.get(name)
-        tables = isinstance(value, list) and value and all(isinstance(v, dict) for v in value)
-        if isinstance(value, Mapping) and isinstance(known, Mapping):
-            _say(known, value)
-        elif tables and isinstance(known, list) and len(known) == len(value):
-            for own, one in zip(known, value, strict=True):
-                _say(own, one)
-        elif isinstance(known, list) and known and known == value[: len(known)]:
-            known.extend(value[len(known) :])
-            _folded(known)
-        elif known is None or known != value:
-            there[name] = value
-            _folded(there[name])

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import expit
 
 from elastocal.cell import Cell, read_cell
-from elastocal.config import MAX_BYTES, read_toml, rewritten_toml
+from elastocal.config import MAX_BYTES, folded, rewritten_toml
 from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import (
@@ -110,27 +110,32 @@ def write_extended_cell(
 
     Raises InputError where `source` is no valid cell file or `target` cannot be written."""
     source, target = Path(source), Path(target)
-    data = {"name": read_cell(source).name} | read_toml(source, "cell file")
+    name = read_cell(source).name
     # The real folders: ".." of a link to a folder is not where the link stands.
-    data = _redirected(data, source.parent, os.path.realpath(target.parent))
-    model = data.setdefault("model", {}) if found else {}
-    for f in found:
-        effects = model.setdefault("effects", [])
-        if (entry := f"{f.effect}:{f.where}") not in effects:
-            effects.append(entry)
-        values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
-        if hints := effect_of(f.effect).hints(f.where, values):
-            model.setdefault("nominal", {}).update(hints)
-        for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
-            if found_there:
-                _join(model, {"nominal": {key: {f.where: found_there}}})
-    model |= dict(model_keys or {})
-    if keys:
-        data.get("design", {}).pop("choose", None)
-        _join(data, keys)
-    text = rewritten_toml(
-        re.sub(ENDS.format(".*"), "", read_text(source, "cell file", MAX_BYTES)), data
-    )
+    folders = source.parent, os.path.realpath(target.parent)
+
+    def change(data: Any) -> None:
+        data.setdefault("name", name)
+        _redirect(data, *folders)
+        model = data.setdefault("model", {}) if found else {}
+        for f in found:
+            effects = model.setdefault("effects", [])
+            if (entry := f"{f.effect}:{f.where}") not in effects:
+                effects.append(entry)
+            values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
+            if hints := effect_of(f.effect).hints(f.where, values):
+                model.setdefault("nominal", {}).update(hints)
+            for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
+                if found_there:
+                    _join(model, {"nominal": {key: {f.where: found_there}}})
+        folded(model.get("effects"))
+        model.update(model_keys or {})
+        if keys:
+            data.get("design", {}).pop("choose", None)
+            _join(data, keys)
+
+    text = re.sub(ENDS.format(".*"), "", read_text(source, "cell file", MAX_BYTES))
+    text = rewritten_toml(text, change)
     with atomic_writer(target) as handle:
         handle.write(text)
         handle.flush()
@@ -156,16 +161,16 @@ def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:
             data[name] = value
 
 
-def _redirected(value: Any, old: Path, new: str, key: str = "") -> Any:
-    """A value whose paths lead from the folder `new` to the files that they lead to from `old`."""
-    if isinstance(value, dict):
-        return {name: _redirected(part, old, new, name) for name, part in value.items()}
-    if isinstance(value, list):
-        return [_redirected(part, old, new, key) for part in value]
-    of_file = key in PATHS or (key == "modules" and is_plugin_file(value))
-    if not of_file or not isinstance(value, str) or os.path.isabs(value):
-        return value
-    return Path(os.path.relpath(os.path.realpath(old / value), new)).as_posix()
+def _redirect(there: Any, old: Path, new: str, key: str = "") -> None:
+    """Paths in a table or list lead from the folder `new` to the files that they led to from
+    `old`."""
+    for at, value in list(there.items() if isinstance(there, dict) else enumerate(there)):
+        name = at if isinstance(there, dict) else key
+        of_file = name in PATHS or (name == "modules" and is_plugin_file(str(value)))
+        if isinstance(value, dict | list):
+            _redirect(value, old, new, name)
+        elif of_file and isinstance(value, str) and not os.path.isabs(value):
+            there[at] = Path(os.path.relpath(os.path.realpath(old / value), new)).as_posix()
 
 
 @dataclass(frozen=True)
