@@ -394,11 +394,6 @@ def _import(name: str) -> None:
 def _run_file(path: Path, where: str) -> None:
     import zlib
 
-    try:
-        from cloudpickle import register_pickle_by_value
-    except ImportError:  # joblib before 1.6 carries its own
-        from joblib.externals.cloudpickle import register_pickle_by_value
-
     path = path.resolve()
     source = read_bytes(path, "plug-in", MAX_BYTES)
     # No file is written beside the user's own, as an import would.
@@ -407,7 +402,6 @@ def _run_file(path: Path, where: str) -> None:
     sys.modules[module.__name__] = module
     with _running(where, str(path)):
         exec(compile(source, str(path), "exec"), module.__dict__)
-    register_pickle_by_value(module)  # workers, which have not run it, are sent its classes
     RAN[path] = source
 
 
