@@ -45,7 +45,7 @@ from elastocal.model.effects.smooth import JointCurve
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import observe, rows_needed, subset
+from elastocal.model.observations import observe
 from elastocal.units import Array, BoolArray
 
 # What each need of an effect asks the user to record.
@@ -347,84 +347,62 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 #
 # The geometry of a spring has no derivative at stiffness zero.  So the stiffness is estimated for
 # each start that the effect proposes, the best start is kept, and the geometry's columns are those
-# at that stiffness.  An effect that knows the profile of its column about a start is tried from
-# hundreds of them by a product of matrices each, and the best is refined; the evidence is then
-# that of the mean over all starts, as with settings.
+# at that stiffness.  An effect that knows the torque about its joint, its profile, is tried from
+# hundreds of them by a product of matrices each: the column is the joint's motion times the profile
+# and the compliance.  The evidence is then that of the mean over all starts, as with settings.
 
-ROWS = 3000  # of the equations, as many as tell one start from another
-REFERENCES = 4  # starts about which the whole model is evaluated, for the factors of the rows
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
-MOST_STEPS, STEP, ENOUGH = 40, 1e-7, 1e-8  # of the refinement, in widths of the starts and of χ²
+MOST_STEPS, ENOUGH = 40, 1e-8  # of the refinement, and of χ²
+STEP = 1e-6  # by which columns are differentiated, in widths of the starts or typical sizes
 SAME = 0.05  # of χ²: a difference that is none
+
+Start = Mapping[str, float]
 
 
 class StartSearch:
-    """The starts of one hypothesis against the residual of the fitted arm, about x (K,) and B
-    (n_rows, size, K) of `full`, by its `model` without all that stands at nominal there.
+    """The starts of one hypothesis against the residual of the fitted arm, `columns` about it.
 
-    `part` are some of the observations, from the table's `rows`.  `X` (equations, parameters) are
-    the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
-    equation for the prior of each fitted parameter; `whitening` (N, size, size) divides by the
-    noise.  Of the effect's parameters, whose numbers are `own`, the first is the amplitude that the
-    others have no columns without."""
+    Equations are those of the readings that were measured over the noise, by which `whitening`
+    (N, size, size) divides, and one for the prior of each fitted parameter.  Of the effect's
+    parameters the first is the amplitude that the others have no columns without."""
 
-    def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
-        self.h, self.base = h, base
-        moved = zip(full.parameters, x, strict=True)
-        acting = {(p.effect, p.where) for p, v in moved if v != p.nominal} | {h.key}
-        known, every = base.model.cell.model.effects, full.cell.model.effects
-        effects = tuple(e for e in every if e in known or (e.name, e.where) in acting)
-        self.model = made_once(full, effects, lambda: full.with_effects(effects))
-        at = dict(zip(full.names, x, strict=True))
-        self.x = np.array([at[name] for name in self.model.names])
-        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in self.model.parameters])
-        self.starts: tuple[dict[str, float], ...] = h.starts(base.model) or ({},)
-        fitted, size = [full.names.index(name) for name in base.model.names], base.observed.size
+    def __init__(self, columns: Columns, h: Hypothesis) -> None:
+        self.h, self.at = h, columns
+        base, model = columns.base, columns.base.model
+        geometry, self.nominal = h.parameters[1:], h.parameters[0].nominal
+        starts: tuple[dict[str, float], ...] = h.starts(model) or ({},)
+        self.starts = [{p.key: p.nominal for p in geometry} | start for start in starts]
+        self.typical = [p.typical or 1.0 for p in geometry]
+        fitted, width = [columns.full.names.index(n) for n in model.names], prior_deviations(base)
         # What is only planned has no residual yet that a spring could answer for.
-        last = base.n_measured - 1
-        chosen = np.zeros(len(base.observed.lead), dtype=bool)
-        chosen[np.linspace(0, last, min(ROWS // size, last + 1)).astype(int)] = True
-        self.part = subset(base.observed, chosen)
-        self.rows = rows_needed(base.observed, chosen)
-        self.whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[chosen]))
-        width = prior_deviations(base)
-        X = self.part.apply(B[self.rows][:, :, fitted]) * width
-        r = base.residual.reshape(-1, size, 1)[chosen]
-        r = r + X @ (from_centre(base) / width)[:, None]
-        rows = len(self.part.lead) * size
-        X, r = ((self.whitening @ each).reshape(rows, -1) for each in (X, r))
-        self.r = np.append(r[:, 0], np.zeros(X.shape[1]))
-        self.X = np.vstack([X, np.eye(X.shape[1])])
-        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
+        self.whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[: base.n_measured]))
+        B = base.observed.apply(columns.rows[:, :, fitted]) * width
+        r = base.residual.reshape(*B.shape[:2], 1) + B @ (from_centre(base) / width)[:, None]
+        X, r = (np.vstack([self._white(B), np.eye(len(width))]), self._white(r)[:, 0])
+        self.dof, r = max(len(r) - 1, 1), np.append(r, np.zeros(len(width)))
+        U, s, _ = np.linalg.svd(X, full_matrices=False)
         self._span: Array = U[:, s > 1e-9 * s.max(initial=0.0)]
-        self._unexplained = self.r - self._span @ (self._span.T @ self.r)
+        self._unexplained = r - self._span @ (self._span.T @ r)
+
+    def _white(self, columns: Array) -> Array:
+        """Columns (N, size, k) of the observations over the noise (equations, k)."""
+        measured = self.whitening @ columns[: len(self.whitening)]
+        return np.asarray(measured.reshape(-1, columns.shape[2]))
 
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
         effect's parameters (k,) and their columns (n_rows, size, k)."""
-        own, table = self.own, self.base.observed.table
         for start in self.screened[0]:
-            at, column = self._amplitude(start, table)
-            at[own[0]] += self._fits(column[self.rows][:, :, None])[1][0]
-            observed = observe(table, self.model.observe)
-            columns = self.model.regressor(table, at, own, observed).B
-            columns = columns.reshape(len(table), observed.size, -1)
-            columns[:, :, 0] = column
-            yield at[own], columns
-
-    def _amplitude(self, start: Mapping[str, float], table: Measurements) -> tuple[Array, Array]:
-        """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
-        at = self.x.copy()
-        at[self.own[0]] = self.h.parameters[0].nominal
-        for key, value in start.items():
-            at[self.model.names.index(f"{self.h.where}.{key}")] = value
-        observed = observe(table, self.model.observe)
-        column = self.model.regressor(table, at, self.own[:1], observed).B
-        return at, column.reshape(len(table), observed.size)
+            steps = STEP * np.array(self.typical)
+            moved = ({key: start[key] + step} for key, step in zip(start, steps, strict=True))
+            C = self._columns([start, *({**start, **one} for one in moved)])
+            amplitude = self._fits(C[:, :, :1])[1][0]
+            C[:, :, 1:] = (C[:, :, 1:] - C[:, :, :1]) * (amplitude / steps)
+            yield np.array([self.nominal + amplitude, *start.values()]), C
 
     @cached_property
-    def screened(self) -> tuple[list[Mapping[str, float]], float]:
+    def screened(self) -> tuple[list[Start], float]:
         """The best starts, the first of them refined, and the log of the mean likelihood over all
         relative to the best one's."""
         starts = self.starts
@@ -432,8 +410,7 @@ class StartSearch:
         each = [self._left(starts[block]) for block in blocks]
         left = np.concatenate([one for one, _ in each])
         beside = np.concatenate([C for _, C in each], axis=1)
-        dof = max(len(self.r) - self.X.shape[1] - 1, 1)
-        variance = max(float(left.min()), 1e-300) / dof
+        variance = max(float(left.min()), 1e-300) / self.dof
         share = float(np.log(np.exp((left.min() - left) / (2 * variance)).mean()))
         # Starts that say the same stand in their own order, whatever the rounding.
         order = np.argsort(np.round((left - left.min()) / (SAME * variance)), kind="stable")
@@ -443,19 +420,17 @@ class StartSearch:
                 break
             if np.abs(beside[:, kept].T @ beside[:, k]).max(initial=0.0) < ALIKE:
                 kept.append(int(k))
-        best = starts[kept[0]]
-        if self._factor is not None:
-            best = self._refined(starts, best, np.sqrt(variance))
+        best = self._refined(starts[kept[0]], np.sqrt(variance))
         return [best, *(starts[k] for k in kept[1:])], share
 
-    def _refined(
-        self, starts: Sequence[dict[str, float]], best: dict[str, float], noise: float
-    ) -> dict[str, float]:
+    def _refined(self, best: Start, noise: float) -> Start:
         """The start near `best` that leaves the least: least squares with the amplitude solved for
         (variable projection; Golub and Pereyra 1973).  Where the residual, over `noise`, does not
         ask for another value, a value stays: each is tied to that of `best` by a spread of all."""
+        if self._factor is None:
+            return best  # each step would take an evaluation of the whole model
         keys = list(best)
-        width = np.array([np.std([start[key] for start in starts]) for key in keys])
+        width = np.array([np.std([start[key] for start in self.starts]) for key in keys])
         x0 = np.array([best[key] for key in keys])
 
         def start_of(values: Array) -> dict[str, float]:
@@ -473,47 +448,55 @@ class StartSearch:
         far = np.full(len(keys), np.inf)
         return start_of(climb(objective, np.zeros(len(keys)), -far, far, ENOUGH, MOST_STEPS)[0])
 
-    def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
-        """The amplitude's (rows, size, starts), by the whole model at each start."""
-        return np.stack([self._amplitude(start, self.part.table)[1] for start in starts], axis=2)
-
-    def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
-        """(rows, starts)."""
-        own = self.h.effect.profiles if starts[0] else None
-        return None if own is None else own(self.h.where, starts, self.part.table.q)
-
     @cached_property
     def _factor(self) -> Array | None:
-        """(rows, size): what a profile is to be multiplied with for the amplitude's column; None
-        where the effect knows no profiles."""
-        chosen = np.linspace(0, len(self.starts) - 1, REFERENCES).astype(int)
-        references = [self.starts[k] for k in chosen]
-        if (profiles := self._profiles(references)) is None:
+        """(n_rows, size): what a profile is to be multiplied with for the amplitude's column; None
+        where the effect knows no profiles.  The compliance is one, or one at each level."""
+        where, at, base = self.h.where, self.at, self.at.base
+        motion, own = at.places.get((JointMotion.name, where)), at.places[self.h.key]
+        table, names = base.observed.table, list(self.starts[0])
+        here = dict(zip(names, at.x[own][1:].tolist(), strict=True))
+        profiles = self.h.effect.profiles(where, [here], table.q)
+        if motion is None or profiles is None:
             return None
-        products = np.einsum("nis,ns->ni", self._columns(references), profiles)
-        return np.asarray(products / np.maximum((profiles**2).sum(axis=1), 1e-300)[:, None])
+        E, profile = at.rows[:, :, motion][:, :, 0], profiles[:, 0]
+        levels = np.array(base.model.cell.model.compliance_levels.get(where, (0.0,)))
+        level = np.abs(table.q[:, [index(where)]] - levels).argmin(axis=1)
+        shown = np.bincount(level, (at.rows[:, :, own.start] * E).sum(axis=1) * profile)
+        most = np.bincount(level, (E**2).sum(axis=1) * profile**2)
+        return np.asarray(E * (shown / np.maximum(most, 1e-300))[level, None])
 
-    def _left(self, starts: Sequence[Mapping[str, float]]) -> tuple[Array, Array]:
+    def _columns(self, starts: Sequence[Start]) -> Array:
+        """The amplitude's (n_rows, size, starts) about each start."""
+        table, full = self.at.base.observed.table, self.at.full
+        if self._factor is not None:
+            profiles = self.h.effect.profiles(self.h.where, starts, table.q)
+            assert profiles is not None
+            return np.asarray(self._factor[:, :, None] * profiles[:, None, :])
+        own, observed = self.at.places[self.h.key], observe(table, full.observe)
+        each = []
+        for start in starts:  # as the whole model says
+            x = self.at.x.copy()
+            x[own] = self.nominal, *start.values()
+            each.append(full.regressor(table, x, np.array([own.start]), observed).B)
+        return np.stack(each, axis=-1).reshape(len(table), observed.size, len(starts))
+
+    def _left(self, starts: Sequence[Start]) -> tuple[Array, Array]:
         """What is left of the residual's sum of squares (starts,), all of it where the amplitude
         is one that the effect cannot have, and the unit columns (rows, starts)."""
-        factor, profiles = self._factor, self._profiles(starts)
-        if factor is None or profiles is None:
-            columns = self._columns(starts)
-        else:
-            columns = factor[:, :, None] * profiles[:, None, :]
-        left, amplitudes, C = self._fits(columns)
+        left, amplitudes, C = self._fits(self._columns(starts))
         name = f"{self.h.where}.{self.h.parameters[0].key}"
-        chain, cell = self.base.model.chain, self.base.model.cell
+        chain, cell = self.at.base.model.chain, self.at.base.model.cell
         for k, amplitude in enumerate(amplitudes):
             if self.h.effect.unphysical({name: float(amplitude)}, chain, cell):
                 left[k] = self._unexplained @ self._unexplained
         return left, C
 
     def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
-        """Of each of the columns (rows, size, k) by itself what it leaves of the residual's sum
+        """Of each of the columns (n_rows, size, k) by itself what it leaves of the residual's sum
         of squares (k,), its amplitude (k,), and itself of unit length beside the span (rows, k)."""
-        C = (self.whitening @ self.part.apply(columns)).reshape(-1, columns.shape[2])
-        C = np.vstack([C, np.zeros((self.X.shape[1], C.shape[1]))])
+        C = self._white(self.at.base.observed.apply(columns))
+        C = np.vstack([C, np.zeros((len(self._span) - len(C), C.shape[1]))])
         C -= self._span @ (self._span.T @ C)
         size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
         C /= size
@@ -604,15 +587,15 @@ def compute_columns(
     for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
-    shares: dict[tuple[str, str], float] = {}
+    columns = Columns(base, B, places, full, x, {})
     for h in direct:
         own = places[h.key]
         shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
         if not shown.all() and shown.sum() == 1:
-            search = StartSearch(full, h, base, x, B)
-            shares[h.key] = search.screened[1]
+            search = StartSearch(columns, h)
+            columns.shares[h.key] = search.screened[1]
             x[own], B[:, :, own] = next(search.tangents())
-    return Columns(base, B, places, full, x, shares)
+    return columns
 
 
 class RegressorDirection:

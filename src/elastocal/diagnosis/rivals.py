@@ -158,7 +158,7 @@ def imitating_columns(
         signal = replace(data, r=C @ at.beta[data.X.shape[2] :])
         signals.append(Grams(so_far, signal, project(signal, noise)))
     for b, item in enumerate(rivals.rivals):
-        what, of, settings = item.what, dataset.columns, [item.settings]
+        what, settings = item.what, [item.settings]
         if isinstance(what, Hypothesis) and what.settings and len(signals) > 1:
             others = [a for a in range(len(signals)) if a != b]
             lists = [settings_to_try(dataset, what, rivals.rivals[a]) for a in others]
@@ -170,7 +170,7 @@ def imitating_columns(
             settings += [tried[k] for k in dict.fromkeys([*short.argmin(axis=1), *evenly])]
         columns = [dataset.packed(what, each) for each in settings[: 1 + SETTINGS]]
         if isinstance(what, Hypothesis) and what.starts(dataset.base.model):
-            starts = StartSearch(of.full, what, of.base, of.x, of.rows).tangents()
+            starts = StartSearch(dataset.columns, what).tangents()
             columns += [dataset.pack(C) * dataset.sizes_in(what, C) for _, C in starts]
         out.append(columns)
     return out

@@ -98,14 +98,10 @@ def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     return float((left**2).sum()), int((count - 1).sum()) * values.shape[1]
 
 
-def rows_needed(observed: Observations, chosen: BoolArray | IntArray | slice) -> IntArray:
-    return np.unique(observed.combine[chosen].indices).astype(np.int64)
-
-
 def subset(observed: Observations, chosen: BoolArray | IntArray | slice) -> Observations:
     """Of those that hold (N,), or of these numbers, which ascend."""
     value = observed.value.reshape(-1, observed.size)[chosen].ravel()
-    rows = rows_needed(observed, chosen)
+    rows = np.unique(observed.combine[chosen].indices)
     lead, own = np.searchsorted(rows, observed.lead[chosen]), observed.combine[chosen][:, rows]
     return Observations(observed.kind, value, own, lead, observed.table.take(rows))
 

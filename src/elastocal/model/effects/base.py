@@ -371,8 +371,8 @@ class Effect:
         return ()
 
     def profiles(self, place: str, starts: Sequence[Mapping[str, float]], q: Array) -> Array | None:
-        """(n, starts): how the first parameter's columns depend on the joints q (n, joints) about
-        each of some starts, but for a factor of the row that all starts share.  None where only
+        """(n, starts): the torque about the joint where it acts, for each unit of its first
+        parameter, at the joints' values q (n, joints) about each of some starts.  None where only
         the whole model says; with profiles many starts cost little."""
         return None
 
