@@ -420,11 +420,8 @@ LOAD_POINT_MOTION = 1e-2
 
 @dataclass(frozen=True)
 class Generic:
-    """A block: `entry` moved by smooth functions of `covariate`, or ready columns.
-
-    Each of its `components` moves by the same `functions` (C, v, f), or by its `own` (C, v, d, k);
-    `columns` (C, m, k) are packed columns of blocks that vary within a visit.
-    """
+    """A block: each of an entry's `components` moved by the same smooth `functions` (C, v, f) of
+    `covariate`, or ready packed `columns` (C, m, k)."""
 
     kind: str
     covariate: str
@@ -433,7 +430,6 @@ class Generic:
     entry: EntryKey | None = None
     functions: Array | None = None
     components: int = 1
-    own: Array | None = None
     columns: Array | None = None
     source: Covariate | None = None
 
@@ -451,14 +447,13 @@ class Generic:
 
     @property
     def width(self) -> int:
-        given = next(a for a in (self.functions, self.own, self.columns) if a is not None)
+        given = self.columns if self.functions is None else self.functions
+        assert given is not None
         return int(given.shape[-1]) * self.components
 
     @property
     def direction(self) -> Array:
         """The functions for each component that moves (C, v, d, k), written out."""
-        if self.own is not None:
-            return self.own
         assert self.functions is not None
         D = np.einsum("de,cvf->cvdef", np.eye(self.components), self.functions)
         return D.reshape(*D.shape[:3], -1)
@@ -507,14 +502,14 @@ def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
     last = f"link{dataset.table.q.shape[1]}"
     for place, (key, wrench) in wrenches(dataset):
         # Beyond the last link there is only the tool and its markers.
-        where = "tool" if place == last else place
-        parts = np.split(dataset.blocks.of_visits(wrench[dataset.lead]), 2, axis=2)
-        force, moment = (part / max(np.abs(part).max(), 1e-12) * MOTION for part in parts)
-        direction = np.zeros((*force.shape[:2], 6, 18))
-        for a in range(3):
-            direction[:, :, a, 3 * a : 3 * a + 3] = force
-            direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = moment
-        yield Generic("force", f"force at {where}", where, "compliance", key, own=direction)
+        where, axes = "tool" if place == last else place, np.eye(3)
+        force, moment = (
+            np.kron(axes, part[:, None] / max(np.abs(part).max(), 1e-12) * MOTION)
+            for part in np.split(wrench, 2, axis=1)
+        )
+        E = dataset.columns.entry(key)
+        columns = dataset.pack(np.concatenate([E[:, :, :3] @ force, E[:, :, 3:] @ moment], axis=2))
+        yield Generic("force", f"force at {where}", where, "compliance", columns=columns)
 
 
 def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:

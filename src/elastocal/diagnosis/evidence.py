@@ -332,11 +332,8 @@ class Grams:
     def of(self, what: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
         """A block, or a hypothesis at all `settings` (G, …), by default those of the search."""
         dataset = self.dataset
-        if isinstance(what, Generic) and what.entry is not None:
-            sums = self.entry(what.entry)
-            if what.functions is not None:
-                return sums.alike(what.functions)
-            return sums.driven(what.direction[:, :, :, None])
+        if isinstance(what, Generic) and what.entry and what.functions is not None:
+            return self.entry(what.entry).alike(what.functions)
         if isinstance(what, Generic) or not what.driven:
             return direct(self.data.masked(dataset.packed(what)), self.at, self._residuals)
         tried = dataset.grids[what.key].values if settings is None else settings

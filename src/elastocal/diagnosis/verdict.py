@@ -39,8 +39,9 @@ from elastocal.identification import noise_summary
 from elastocal.identification.solve import FAR, far_off
 from elastocal.measurements import told_of_rounding
 from elastocal.messages import listed, rounded
+from elastocal.model.effects.base import LinkFrame
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.geometry import Backlash
+from elastocal.model.effects.geometry import KEYS, Backlash
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray
@@ -109,9 +110,6 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
 
 
 MOST_CURVES = 3
-TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
-TURNS = ((" rx", "rad"), (" ry", "rad"), (" rz", "rad"))
-COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # name and unit
 
 FARTHEST = 10.0  # times what was found that a time constant may be, or part of it
 
@@ -287,9 +285,10 @@ class FewAnswer(SumAnswer):
             deviation = np.linalg.norm(direction @ at.beta_deviation.T[span], axis=2)
             largest = np.argsort(-(motion.std(axis=0) / deviation.mean(axis=0)))
             for k in largest[:MOST_CURVES]:
-                (name, unit), y = COMPONENTS[motion.shape[1]][k], motion[order, k]
+                alone, y = motion.shape[1] == 1, motion[order, k]
                 xyd = (tuple(v.tolist()) for v in (x, y - y.mean(), deviation[order, k]))
-                entry = f"{block.where}{name}"
+                entry = block.where if alone else f"{block.where} {KEYS[k]}"
+                unit = "rad" if alone else LinkFrame.units[k]
                 out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
         return tuple(out)
 
