@@ -225,13 +225,9 @@ class EntrySums:
         numbers, of `width` columns each."""
         step = max(1, HELD // (self.H[0].size * width))
         D = (directions(slice(k, k + step)) for k in range(0, n, step))
-        parts = list(ahead(self.driven, D, threads))
+        parts = list(ahead(lambda some: Spectrum.of(*self.products(some)), D, threads))
         lam, beta = (np.concatenate([getattr(s, k) for s in parts]) for k in ("lam", "beta"))
         return Spectrum(lam, beta)
-
-    def driven(self, D: Array) -> Spectrum:
-        """Spectrum of the groups with directions D, as `products` takes them."""
-        return Spectrum.of(*self.products(D))
 
     def alike(self, F: Array) -> Spectrum:
         """Spectrum of one group in which all motions follow the same functions F (C, v, f)."""
