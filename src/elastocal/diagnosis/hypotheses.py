@@ -354,7 +354,7 @@ def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
 MOST_STEPS, ENOUGH = 40, 1e-8  # of the refinement, and of χ²
-STEP = 1e-6  # by which columns are differentiated, in widths of the starts or typical sizes
+STEP = 1e-6  # by which it differentiates, in widths of the starts
 SAME = 0.05  # of χ²: a difference that is none
 
 Start = Mapping[str, float]
@@ -373,7 +373,6 @@ class StartSearch:
         geometry, self.nominal = h.parameters[1:], h.parameters[0].nominal
         starts: tuple[dict[str, float], ...] = h.starts(model) or ({},)
         self.starts = [{p.key: p.nominal for p in geometry} | start for start in starts]
-        self.typical = [p.typical or 1.0 for p in geometry]
         fitted, width = [columns.full.names.index(n) for n in model.names], prior_deviations(base)
         # What is only planned has no residual yet that a spring could answer for.
         self.whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[: base.n_measured]))
@@ -393,13 +392,14 @@ class StartSearch:
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
         effect's parameters (k,) and their columns (n_rows, size, k)."""
+        full, own, table = self.at.full, self.at.places[self.h.key], self.at.base.observed.table
+        observed, columns = observe(table, full.observe), np.arange(own.start, own.stop)
         for start in self.screened[0]:
-            steps = STEP * np.array(self.typical)
-            moved = ({key: start[key] + step} for key, step in zip(start, steps, strict=True))
-            C = self._columns([start, *({**start, **one} for one in moved)])
-            amplitude = self._fits(C[:, :, :1])[1][0]
-            C[:, :, 1:] = (C[:, :, 1:] - C[:, :, :1]) * (amplitude / steps)
-            yield np.array([self.nominal + amplitude, *start.values()]), C
+            column, x = self._columns([start]), self.at.x.copy()
+            x[own] = self.nominal + self._fits(column)[1][0], *start.values()
+            C = full.regressor(table, x, columns, observed).B.reshape(len(table), observed.size, -1)
+            C[:, :, :1] = column
+            yield x[own], C
 
     @cached_property
     def screened(self) -> tuple[list[Start], float]:
