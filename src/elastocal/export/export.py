@@ -171,7 +171,8 @@ def export(
         (fitted and loads > 1 and not kept.exported.elastic,
          f"the arm sags under its load and this file cannot: it is fitted to all {loads} loads "
          f"measured; state {option('load')} for the one that it is for"),
-        (calibrated.elastic and not cost.forces.any() and not spec.link_gravity,
+        (calibrated.elastic and wish.load is None and not cost.forces.any()
+         and not spec.link_gravity,
          f"no load is given, so compliances cost nothing here: state one with {option('load')} "
          "(N, in the tracker's axes)"),
         (calibrated.untried(cost.forces), calibrated.untried(cost.forces)),
