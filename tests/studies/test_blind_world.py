@@ -239,7 +239,7 @@ def test_what_the_catalogue_lacks_is_corrected_without_a_name(tmp_path, seed, ef
 
     (_, whole), (fields, without) = error(), error(effect)
     assert fields == {corrected_by} and without < 1.1 * whole
-    fields, neither = error(effect, corrected_by)
+    fields, neither = error(effect, corrected_by, "residual_field")
     assert corrected_by not in fields and neither > 1.1 * without
 
 
