@@ -315,7 +315,7 @@ def held_out_by_parts(
     `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
     the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
     step to the linear model's minimum, where x is not it."""
-    held, leverage, left = np.empty((3, len(problem.observations.value)))
+    held, leverage, left = np.ones((3, len(problem.observations.value)))
     together, size = problem.weights.together, problem.observations.size
 
     def leave_out(part: Problem) -> None:
@@ -329,7 +329,8 @@ def held_out_by_parts(
         labels = part.observations.configuration if together is None else together
         held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, size))
         leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
-        left[part.rows] = share_left(Q, np.repeat(part.observations.configuration, size))
+        if not problem.large:  # of which nobody asks it
+            left[part.rows] = share_left(Q, np.repeat(part.observations.configuration, size))
 
     list(problem.each(leave_out))
     return held, leverage, left
