@@ -82,19 +82,16 @@ class StudyFile(Table):
     )
 
 
-@dataclass
-class Study:
+@dataclass(frozen=True)
+class Sources:
     """The .py files of a study's folder and the files that study.toml names, and what it states,
-    with options and seed settled; its tasks in their order, as what their lines of results begin
-    with (`task`, `task_hash`, `values`).  A worker, which gets no tasks with it, uses the same
-    folder with the same contents where it has one, and else unpacks this: a cluster needs no shared
-    file system."""
+    with options and seed settled.  A worker that has the same folder with the same contents uses it
+    there, any other unpacks this one, so a cluster needs no shared file system."""
 
     folder: Path
     contents: Mapping[str, bytes]
     stated: StudyFile
     version: str = __version__
-    tasks: tuple[Row, ...] = ()
 
     @cached_property
     def digests(self) -> dict[str, str]:
@@ -104,8 +101,15 @@ class Study:
     def digest(self) -> str:
         return _hash(*map(" ".join, sorted(self.digests.items())))
 
-    def __getstate__(self) -> dict[str, Any]:
-        return vars(self) | {"tasks": ()}
+
+@dataclass(frozen=True)
+class Study:
+    """A study ready to run, with its tasks in their order: what their lines of results begin with
+    (`task`, `task_hash`, `values`)."""
+
+    folder: Path
+    sources: Sources
+    tasks: tuple[Row, ...]
 
 
 def read_study(folder: str | Path, seed: int | None = None, options: Iterable[str] = ()) -> Study:
@@ -124,9 +128,8 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
     settled: dict[str, Any] = {"title": stated.title or whole.name, "options": chosen}
     settled |= {} if seed is None else {"seed": seed}
-    study = Study(folder, _contents(whole, stated, path), stated.model_copy(update=settled))
-    study.tasks = tuple(_tasks(study))
-    return study
+    sources = Sources(whole, _contents(whole, stated, path), stated.model_copy(update=settled))
+    return Study(folder, sources, tuple(_tasks(folder, load(sources), sources)))
 
 
 def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
@@ -162,15 +165,13 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
     return options
 
 
-def _tasks(study: Study) -> Iterator[Row]:
-    script, stated, module = study.folder / "study.py", study.stated, load(study)
+def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
+    script, stated = folder / "study.py", sources.stated
     for name in ("tasks", "run"):
         told = f"defines no function {name}(); a study has tasks(options) and run(task, rng)"
         require(callable(getattr(module, name, None)), f"{script}: {told}")
     given = dict(stated.options)
-    found = calling(
-        study.folder, "tasks()", lambda: list(islice(module.tasks(given), MAX_TASKS + 1))
-    )
+    found = calling(folder, "tasks()", lambda: list(islice(module.tasks(given), MAX_TASKS + 1)))
     require(found, f"{script}: tasks() gives no task with these options; nothing to do")
     told = f"tasks() gives more than {MAX_TASKS} tasks with these options; let each do more"
     require(len(found) <= MAX_TASKS, f"{script}: {told}")
@@ -184,12 +185,16 @@ def _tasks(study: Study) -> Iterator[Row]:
             told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
             require(key not in stated.columns, told)
         values = json.loads(_json(where, dict(task)))
-        told = _hash(study.digest, stated.seed, index, json.dumps(values, sort_keys=True))
+        told = _task_hash(sources.digest, stated.seed, index, values)
         yield {"task": index, "task_hash": told, "values": values}
 
 
 def _hash(*parts: object) -> str:
     return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
+
+
+def _task_hash(digest: str, seed: int, index: int, values: Row) -> str:
+    return _hash(digest, seed, index, json.dumps(values, sort_keys=True))
 
 
 def _json(where: str, value: Any) -> str:
@@ -200,11 +205,11 @@ def _json(where: str, value: Any) -> str:
         raise InputError(f"{where}: {error}; use plain JSON values: {told}") from None
 
 
-def load(study: Study) -> ModuleType:
+def load(sources: Sources) -> ModuleType:
     """The module study.py, imported once per process as long as no other study comes."""
     global _here
     with _LOCK:
-        if _here is None or _here[0] != study.digest:
+        if _here is None or _here[0] != sources.digest:
             if _here is not None:
                 # A worker outlives a study, and two may have a scenarios.py.
                 for name, module in list(sys.modules.items()):
@@ -213,7 +218,7 @@ def load(study: Study) -> ModuleType:
                 sys.path[:] = [place for place in sys.path if place != str(_here[1])]
                 importlib.invalidate_caches()
             sys.modules.pop("study", None)  # of that name somebody else's
-            _here = study.digest, _standing(study)
+            _here = sources.digest, _standing(sources)
             sys.path.insert(0, str(_here[1]))
         # Nothing is left in the user's folder: no bytecode of its modules.
         before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
@@ -225,13 +230,13 @@ def load(study: Study) -> ModuleType:
         return found
 
 
-def _standing(study: Study) -> Path:
+def _standing(sources: Sources) -> Path:
     with suppress(OSError):
-        if all((study.folder / n).read_bytes() == d for n, d in study.contents.items()):
-            return study.folder.resolve()
+        if all((sources.folder / n).read_bytes() == d for n, d in sources.contents.items()):
+            return sources.folder
     folder = Path(tempfile.mkdtemp(prefix="elastocal-study-")).resolve()
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    for name, data in study.contents.items():
+    for name, data in sources.contents.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
     return folder
@@ -256,17 +261,17 @@ def line_of(task: Row, error: str | None = None, **found: Any) -> Row:
     return task | line | {"trace": error} | found
 
 
-def execute(study: Study, task: Row) -> Row:
+def execute(sources: Sources, task: Row) -> Row:
     """The line of results of a task, whose draws are those of child `task` of SeedSequence(seed),
     whoever computes it and however many there are."""
     begun = time.perf_counter()
-    draws = np.random.SeedSequence(study.stated.seed, spawn_key=(task["task"],))
+    draws = np.random.SeedSequence(sources.stated.seed, spawn_key=(task["task"],))
     try:
-        if study.version != __version__:
+        if sources.version != __version__:
             told = f"this worker has elastocal {__version__}, the study was started with"
-            raise RuntimeError(f"{told} {study.version}; install the same there")
-        found = load(study).run(deepcopy(task["values"]), np.random.default_rng(draws))
-        line = line_of(task, rows=_checked_rows(found, study.stated.columns, task["values"]))
+            raise RuntimeError(f"{told} {sources.version}; install the same there")
+        found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
+        line = line_of(task, rows=_checked_rows(found, sources.stated.columns, task["values"]))
     except (Exception, SystemExit) as error:
         told = " ".join([f"{type(error).__name__}:", *str(error).split()])
         line = line_of(task, told, trace=traceback.format_exc())
@@ -416,7 +421,7 @@ def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int 
 
     jobs = jobs or loky.cpu_count()
     if jobs == 1:
-        yield from (execute(study, task) for task in tasks if not stop.asked)
+        yield from (execute(study.sources, task) for task in tasks if not stop.asked)
         return
     env = {name: os.environ.get(name, "1") for name in ONE_THREAD}
     # Of a pool that is started anew where a process died.
@@ -465,7 +470,7 @@ def _lines(
         most = 0 if stop.asked or not waiting else 1 if died[waiting[0]["task"]] else room()
         while waiting and len(out) < most:
             task = waiting.popleft()
-            out[submit(execute, study, task)] = task
+            out[submit(execute, study.sources, task)] = task
         for future in wait(out, return_when=FIRST_COMPLETED).done:
             task = out.pop(future)
             try:
@@ -568,7 +573,7 @@ def run_study(
     ClusterLostError where the scheduler goes away."""
     folder, stop = Path(output), stop or StudyStop()
     with opened(folder):
-        known = [] if restart else _known(study, folder, retry_failed)
+        known, earlier = ([], []) if restart else _known(study, folder, retry_failed)
         kept = [line for line in known if not (retry_failed and line["task_error"])]
         there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
@@ -581,12 +586,12 @@ def run_study(
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
             atomic_write(folder / RESULTS, "".join(map(as_text, kept)))
-        stated = study.stated
+        stated = study.sources.stated
         statement = {
             "schema": SCHEMA, "title": stated.title, "seed": stated.seed,
             "options": stated.options, "tasks": len(study.tasks), "columns": stated.columns,
-            "sources": study.digests, "elastocal": __version__,
-        }  # fmt: skip
+            "sources": study.sources.digests, "elastocal": __version__,
+        } | ({"earlier": earlier} if earlier else {})  # fmt: skip
         atomic_write(folder / STATEMENT, messages.json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
@@ -605,29 +610,32 @@ def run_study(
     return Ending(total, before, ended - failed, failed, stop.asked)
 
 
-def _known(study: Study, folder: Path, retry_failed: bool) -> list[Row]:
-    """The lines of results there are, which are of this study; where those that failed are to run
-    again its sources may have been corrected since."""
+def _known(study: Study, folder: Path, retry_failed: bool) -> tuple[list[Row], list[str]]:
+    """The lines of results there are, and the digests of earlier sources that made some of them."""
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
-    before, stated, lines = statement_of(folder), study.stated, result_lines(folder)
+    before, columns = statement_of(folder), study.sources.stated.columns
     told = f"{folder}: has other columns, types or units than the study now. {here}"
-    require(before.get("columns", stated.columns) == stated.columns, told)
+    require(before.get("columns", columns) == columns, told)
+    lines, seed = result_lines(folder), study.sources.stated.seed
     failed = any(line["task_error"] for line in lines)
-    same = before.get("seed", stated.seed) == stated.seed and (
-        (retry_failed and failed) or before.get("sources", study.digests) == study.digests
-    )
-    values = {task["task"]: task["values"] for task in study.tasks}
-    other = [k for line in lines if values.get(k := line["task"], line["values"]) != line["values"]]
-    if lines and (other or not same):
-        changes = _changes(study, before) or [f"task {other[0]} was another one"]
-        told = f"{folder}: holds results of another study: {'; '.join(changes)}"
-        retry = f", with {option('retry_failed', True)} to run tasks anew that failed"
-        raise InputError(f"{told}. {here} to keep them{retry * failed}")
-    return lines
+    earlier = list(before.get("earlier", []))
+    if retry_failed and failed:
+        earlier.append(_hash(*map(" ".join, sorted(before.get("sources", {}).items()))))
+    for line in lines:
+        at = line["task"]
+        if at >= len(study.tasks) or study.tasks[at]["task_hash"] == line["task_hash"]:
+            continue
+        values = study.tasks[at]["values"]
+        if line["task_hash"] not in [_task_hash(d, seed, at, values) for d in earlier]:
+            changes = _changes(study, before) or [f"task {at} was another one"]
+            told = f"{folder}: holds results of another study: {'; '.join(changes)}"
+            retry = f", with {option('retry_failed', True)} to run tasks anew that failed"
+            raise InputError(f"{told}. {here} to keep them{retry * failed}")
+    return lines, sorted({*earlier} - {study.sources.digest})
 
 
 def _changes(now: Study, before: dict[str, Any]) -> list[str]:
-    stated, digests = now.stated, now.digests
+    stated, digests = now.sources.stated, now.sources.digests
     sources, options = before.get("sources", {}), before.get("options", {})
     changed = [n for n in sorted({*sources, *digests}) if sources.get(n) != digests.get(n)]
     told = [f"{', '.join(changed)} changed since"] if sources and changed else []
@@ -641,7 +649,7 @@ def _changes(now: Study, before: dict[str, Any]) -> list[str]:
 def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     """What summary(frame) of study.py says of the rows in the order of their tasks, also written to
     `page`; None without one."""
-    if (summary := getattr(load(study), "summary", None)) is None:
+    if (summary := getattr(load(study.sources), "summary", None)) is None:
         return None
     frame = read_results(output)
     frame = frame[frame["task"] < len(study.tasks)]

@@ -143,4 +143,4 @@ def test_the_study_shown_runs(tmp_path):
     assert (ending.done, ending.failed) == (1, 0)
     frame = read_results(tmp_path / "r")
     assert frame["error"].abs().max() < 1.0  # µrad/(N·m)
-    assert load(read_study(folder)).summary(frame).startswith("| readings per pose |")
+    assert load(read_study(folder).sources).summary(frame).startswith("| readings per pose |")

@@ -122,7 +122,7 @@ def with_parts(tmp_path):
 def test_a_worker_without_the_folder_unpacks_it(with_parts, tmp_path, monkeypatch):
     study = read_study(with_parts)
     monkeypatch.setattr("elastocal.studies._here", ("", with_parts.resolve()))
-    elsewhere = replace(study, folder=tmp_path / "not here")
+    elsewhere = replace(study.sources, folder=tmp_path / "not here")
     assert execute(elsewhere, study.tasks[0])["rows"][0]["mean"] == 42
     module = sys.modules["study_part_of_test"]
     assert not module.__file__.startswith(str(with_parts))
@@ -130,7 +130,7 @@ def test_a_worker_without_the_folder_unpacks_it(with_parts, tmp_path, monkeypatc
 
 def test_a_worker_of_another_version_refuses(with_parts):
     study = read_study(with_parts)
-    found = execute(replace(study, version="0.0.1"), study.tasks[0])
+    found = execute(replace(study.sources, version="0.0.1"), study.tasks[0])
     assert "this worker has elastocal" in found["task_error"]
 
 

@@ -49,7 +49,7 @@ def here(study: Study, order: Callable[[list[Any]], list[Any]] = list, stop_afte
 
     def runner(jobs) -> Iterator[Any]:
         for job in order(list(jobs))[:stop_after]:
-            yield execute(study, job)
+            yield execute(study.sources, job)
 
     return runner
 
