@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
+    GaussianPrior,
     LinearEquality,
     Minimum,
     SemidefiniteMatrix,
@@ -134,3 +135,13 @@ def test_what_nothing_determines_is_named_and_an_equality_can_determine_it():
     equal = LinearEquality({"a": 1.0, "b": -1.0})
     found = solve(B, y, NAMES, Constraints(equalities=(equal,))).x
     assert found[0] == pytest.approx(found[1], rel=1e-12)
+
+
+def test_an_impossible_covariance_of_a_prior_is_refused():
+    for covariance, says in (
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "not positive definite"),
+        (np.eye(3), "2 × 2 covariance"),
+        (np.diag([1.0, np.nan]), "finite"),
+    ):
+        with pytest.raises(InputError, match=says):
+            GaussianPrior(("a", "b"), np.zeros(2), covariance)

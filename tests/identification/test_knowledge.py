@@ -48,16 +48,16 @@ def test_a_prior_is_the_ridge_of_the_linear_arm():
     """MAP in closed form on an arm that is linear in its compliances."""
     model, table = drives(), readings(drives(), 4)
     names = ("joint2.compliance", "joint6.compliance")
-    prior = GaussianPrior(names, np.array([3e-7, 2e-6]), np.array([5e-9, 2e-7]))
+    prior = GaussianPrior.independent(names, [3e-7, 2e-6], [5e-9, 2e-7])
     alone = identify(model, table, Options(method="ols"))
     found = identify(model, table, Options(method="ols", prior=prior))
     columns = [model.names.index(n) for n in alone.determined]
     at = model.regressor(table, alone.x, np.array(columns), alone.observations)
     P = np.zeros((2, len(columns)))
     for row, name in enumerate(names):
-        P[row, alone.determined.index(name)] = 1 / prior.std[row]
+        P[row, alone.determined.index(name)] = 1 / np.sqrt(prior.covariance[row, row])
     H = at.B.T @ at.B / alone.sigma**2 + P.T @ P
-    target = P @ alone.x[columns] - prior.mean / prior.std
+    target = P @ alone.x[columns] - prior.mean / np.sqrt(np.diag(prior.covariance))
     V = np.linalg.inv(H)
     np.testing.assert_allclose(found.x[columns], alone.x[columns] - V @ P.T @ target, rtol=1e-7)
     np.testing.assert_allclose(found.covariance, V, rtol=1e-6, atol=1e-8 * np.abs(V).max())
@@ -78,7 +78,7 @@ def test_a_prior_on_one_of_a_pair_tells_the_other():
     alone = identify(model, table)
     assert {known, other}.isdisjoint(e.name for e in alone.estimates if e.identifiable)
     mean, std = 2e-3, 1e-4
-    prior = GaussianPrior((known,), np.array([mean]), np.array([std]))
+    prior = GaussianPrior.independent((known,), [mean], [std])
     found = identify(model, table, Options(prior=prior))
     assert found[known].value == pytest.approx(mean, rel=1e-6)
     assert found.prior_share[known] == pytest.approx(1.0)

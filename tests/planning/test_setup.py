@@ -103,7 +103,7 @@ def test_the_value_is_what_identification_would_leave_at_the_test_poses(case: st
 def test_a_prior_adds_its_information() -> None:
     cell = plan_cell(loads=DOWN[None])
     names, std = ("joint2.compliance", "joint5.compliance"), np.array([1e-9, 2e-8])
-    prior = GaussianPrior(names, np.zeros(2), std)
+    prior = GaussianPrior(names, np.zeros(2), np.diag(std**2))
     setup = setup_of(cell, POSES, known=Known(prior=prior))
     without = setup_of(cell, POSES)
     added = (setup.prior - without.prior) / np.outer(*[setup.information.sizes] * 2)
@@ -114,7 +114,7 @@ def test_a_prior_adds_its_information() -> None:
     assert np.allclose(added, expected, rtol=1e-12)
     assert value_of(setup, TABLE_2) < value_of(without, TABLE_2)
     # What has a prior counts, however little that says.
-    weak = GaussianPrior(("joint1.compliance",), np.zeros(1), np.array([0.1]))
+    weak = GaussianPrior(("joint1.compliance",), np.zeros(1), np.diag([1e-2]))
     kept = setup_of(plan_cell(loads=DOWN[None]), POSES, known=Known(prior=weak)).information.names
     assert "joint1.compliance" in kept and "joint1.compliance" not in without.information.names
 

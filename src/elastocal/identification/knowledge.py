@@ -320,12 +320,33 @@ class PriorTable(Table):
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """x[names] ~ N(mean, std²), independent of each other: mean (k,) and std (k,) in the
-    parameters' units."""
+    """x[names] ~ N(mean, covariance): mean (k,) and covariance (k, k) in the parameters' units.
+
+    Raises InputError where the numbers are not finite or the covariance not positive definite.
+    """
 
     names: tuple[str, ...]
     mean: Array
-    std: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        k = len(self.names)
+        require(len(set(self.names)) == k, f"the prior names a parameter twice: {self.names}")
+        require(
+            self.mean.shape == (k,) and self.covariance.shape == (k, k),
+            f"a prior of {k} parameters needs {k} means and a {k} × {k} covariance; found shapes "
+            f"{self.mean.shape} and {self.covariance.shape}",
+        )
+        finite = np.isfinite(self.mean).all() and np.isfinite(self.covariance).all()
+        require(bool(finite), "the prior's means and covariance must be finite")
+        self._root()
+
+    @classmethod
+    def independent(
+        cls, names: Sequence[str], mean: Sequence[float] | Array, std: Sequence[float] | Array
+    ) -> GaussianPrior:
+        """x_i ~ N(mean_i, std_i²), independent of each other."""
+        return cls(tuple(names), np.asarray(mean, dtype=float), np.diag(np.square(std)))
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> GaussianPrior:
@@ -337,16 +358,30 @@ class GaussianPrior:
         return known
 
     def rows(self, names: Sequence[str]) -> tuple[Array, Array]:
-        """P (k, p) and target (k,) with |target − P x|² = Σ (x − mean)²/std².
+        """P (k, p) and target (k,) with |target − P x|² = (x − mean)ᵀ covariance⁻¹ (x − mean).
 
         Raises InputError for a name that is not among the parameters `names` (p,).
         """
         position = {name: i for i, name in enumerate(names)}
+        root = self._root()
         P = np.zeros((len(self.names), len(position)))
-        for k, name in enumerate(self.names):
+        for name in self.names:
             check_known(name, position, f"the prior names {quoted(name)}, which is not a parameter")
-            P[k, position[name]] = 1 / self.std[k]
-        return P, self.mean / self.std
+        P[:, [position[name] for name in self.names]] = root
+        return P, root @ self.mean
+
+    def _root(self) -> Array:
+        """L⁻¹ of the Cholesky factor; by standardised parameters, whose units are alike."""
+        std = np.sqrt(np.abs(np.diag(self.covariance)))
+        try:
+            require(bool((std > 0).all()), "")
+            L = linalg.cholesky(self.covariance / np.outer(std, std), lower=True)
+        except (linalg.LinAlgError, InputError):
+            raise InputError(
+                "the prior's covariance is not positive definite; leave out parameters that are "
+                "known exactly (fix them) or that repeat another one"
+            ) from None
+        return linalg.solve_triangular(L, np.diag(1 / std), lower=True)
 
 
 def share_of_prior(cofactor: Array, P: Array) -> Array:
@@ -363,8 +398,8 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
 
 
 def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> GaussianPrior | None:
-    mean, std = (np.array([getattr(p, key) for p in tables.values()]) for key in ("mean", "std"))
-    return GaussianPrior(tuple(tables), mean, std) if tables else None
+    means, std = ([getattr(p, key) for p in tables.values()] for key in ("mean", "std"))
+    return GaussianPrior.independent(tuple(tables), means, std) if tables else None
 
 
 class Knowledge(Record):
