@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal import measurements, messages
-from elastocal.above import Result
+from elastocal.above import DataFrame, Result
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
 from elastocal.measurements import Measurements, in_file_units, joint_columns, with_moves
@@ -64,17 +64,15 @@ class Targets:
 
 
 def read_targets(
-    path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None,
-    text: str | None = None,
+    path: str | Path | DataFrame, joint_kinds: tuple[str, ...], frame: Frame,
+    force: Array | None = None,
 ) -> Targets:  # fmt: skip
-    """Targets of a CSV or Parquet file whose columns are those of the measurement table: x_mm,
-    y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone, or both:
-    joints are then the nominal command to start from.  force_x_N … and circumstances (time_s,
-    approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force` (3,) N acts
-    where the table states none."""
-    table = measurements.read_measurements(
-        path, joint_kinds=joint_kinds, observe="targets", text=text
-    )
+    """Targets of a CSV or Parquet file or a data frame whose columns are those of the measurement
+    table: x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg …
+    alone, or both: joints are then the nominal command to start from.  force_x_N … and
+    circumstances (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them;
+    `force` (3,) N acts where the table states none."""
+    table = measurements.read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None
     placed, turned = table.position is not None, table.rotation is not None
     extra = "; a rotation alone is no target" * (turned and q is None)
@@ -91,7 +89,7 @@ def read_targets(
         (force is not None and table.force.any(),
          f"the table has forces of its own; leave {option('load')} away or drop them"),
     ):  # fmt: skip
-        require(not wrong, f"{path}: {told}")
+        require(not wrong, f"{table.source}: {told}")
     if force is not None:
         table = replace(table, force=np.tile(force, (len(table), 1)))
     turn = None if table.rotation is None else Rotation.from_rotvec(table.rotation).as_matrix()

@@ -503,10 +503,10 @@ READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured
 
 
 def read_measurements(
-    path: str | Path, *, joint_kinds: tuple[str, ...], marker_names: tuple[str, ...] = (),
-    observe: str = "position", text: str | None = None,
+    path: str | Path | DataFrame, *, joint_kinds: tuple[str, ...],
+    marker_names: tuple[str, ...] = (), observe: str = "position", text: str | None = None,
 ) -> Measurements:  # fmt: skip
-    """The measurements of a CSV or Parquet (.parquet, .pq) file, in SI units.
+    """The measurements of a CSV or Parquet (.parquet, .pq) file or a data frame, in SI units.
 
     `joint_kinds`: "revolute" or "prismatic" per joint of the robot; `marker_names`: the cell's
     markers, () if it names none; `observe`: "position", "deflection", "pose" or "distance",
@@ -515,6 +515,8 @@ def read_measurements(
     Quaternions become rotation vectors.  With `text` the table is that CSV text, and `path` only
     its name.
     """
+    if not isinstance(path, str | Path):
+        text, path = path.to_csv(index=any(path.index.names)), "DataFrame"
 
     def choose(header: Sequence[str]) -> Columns:
         planned = {"configuration", "level", "order"} <= set(header)

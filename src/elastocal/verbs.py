@@ -645,11 +645,8 @@ def _targets(
 
     if isinstance(targets, Targets):
         return targets
-    if isinstance(targets, str | Path):
+    if isinstance(targets, str | Path) or hasattr(targets, "to_csv"):
         return read_targets(targets, kinds, frame, force)
-    if hasattr(targets, "to_csv"):
-        text = targets.to_csv(index=any(targets.index.names))
-        return read_targets("DataFrame", kinds, frame, force, text)
     found = np.asarray(targets, dtype=float)
     if found.shape in ((3,), (4, 4)):
         found = found[None]

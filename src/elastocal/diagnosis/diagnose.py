@@ -274,6 +274,7 @@ def _diagnosed(
     dataset, found = few.before, few.selected
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
+    turned = turned_base(base.model, base.observed, base.residual)
     tests, answer = structure_tests(found.first), whole or few
     answers = _pieces(answer, dataset, found.nothing.noise, tests, fields)
     added = (*answers["effects"], *answers["slight"])
@@ -296,8 +297,7 @@ def _diagnosed(
         untested=(*untested, *small),
         warnings=(
             *told,
-            *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
-            *filter(None, [turned_base(base.model, base.observed, base.residual)]),
+            *filter(None, [left_out, solved_body(table, float(base.residual.std())), turned]),
             *warnings(dataset, found, suspects, answers["noise"]),
             *confirm(unheard_of(answers["effects"], base.model)),
         ),

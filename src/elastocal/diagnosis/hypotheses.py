@@ -392,14 +392,20 @@ class StartSearch:
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
         effect's parameters (k,) and their columns (n_rows, size, k)."""
-        full, own, table = self.at.full, self.at.places[self.h.key], self.at.base.observed.table
-        observed, columns = observe(table, full.observe), np.arange(own.start, own.stop)
         for start in self.screened[0]:
-            column, x = self._columns([start]), self.at.x.copy()
-            x[own] = self.nominal + self._fits(column)[1][0], *start.values()
-            C = full.regressor(table, x, columns, observed).B.reshape(len(table), observed.size, -1)
+            column = self._columns([start])
+            values = np.array([self.nominal + self._fits(column)[1][0], *start.values()])
+            C = self._of_model(values, len(values))
             C[:, :, :1] = column
-            yield x[own], C
+            yield values, C
+
+    def _of_model(self, values: Array, k: int) -> Array:
+        """The first k of the columns (n_rows, size, k) at the values, by the whole model."""
+        full, own, table = self.at.full, self.at.places[self.h.key], self.at.base.observed.table
+        x, observed = self.at.x.copy(), observe(table, full.observe)
+        x[own] = values
+        B = full.regressor(table, x, own.start + np.arange(k), observed).B
+        return np.asarray(B.reshape(len(table), observed.size, k))
 
     @cached_property
     def screened(self) -> tuple[list[Start], float]:
@@ -468,18 +474,13 @@ class StartSearch:
 
     def _columns(self, starts: Sequence[Start]) -> Array:
         """The amplitude's (n_rows, size, starts) about each start."""
-        table, full = self.at.base.observed.table, self.at.full
         if self._factor is not None:
-            profiles = self.h.effect.profiles(self.h.where, starts, table.q)
+            q = self.at.base.observed.table.q
+            profiles = self.h.effect.profiles(self.h.where, starts, q)
             assert profiles is not None
             return np.asarray(self._factor[:, :, None] * profiles[:, None, :])
-        own, observed = self.at.places[self.h.key], observe(table, full.observe)
-        each = []
-        for start in starts:  # as the whole model says
-            x = self.at.x.copy()
-            x[own] = self.nominal, *start.values()
-            each.append(full.regressor(table, x, np.array([own.start]), observed).B)
-        return np.stack(each, axis=-1).reshape(len(table), observed.size, len(starts))
+        each = (np.array([self.nominal, *start.values()]) for start in starts)
+        return np.concatenate([self._of_model(values, 1) for values in each], axis=2)
 
     def _left(self, starts: Sequence[Start]) -> tuple[Array, Array]:
         """What is left of the residual's sum of squares (starts,), all of it where the amplitude

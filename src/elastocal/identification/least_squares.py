@@ -183,13 +183,17 @@ ALONE = 1e-9  # 1 − leverage below which a cluster is fitted exactly, whatever
 ENTRIES = 2**22  # of a temporary array, 32 MB
 DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
 
-# By number: the power of I − Q_cQ_cᵀ in A_c, and what it is.
-POWERS = {
-    "0": (0.0, "uncorrected (biased low with few {})"),
-    "1": (0.0, "corrected by G/(G − 1) · (n − 1)/(n − p)"),
-    "2": (-0.5, "bias-reduced, unbiased under the working model"),
-    "3": (-1.0, "nearly the jackknife over {}"),
+DESCRIPTION = {
+    "CR0": "uncorrected (biased low with few clusters)",
+    "CR1": "corrected by G/(G − 1) · (n − 1)/(n − p)",
+    "CR2": "bias-reduced, unbiased under the working model",
+    "CR3": "nearly the jackknife over clusters",
+    "HC0": "e² as it is (biased low in small samples)",
+    "HC1": "e² · n/(n − p)",
+    "HC2": "e²/(1 − h), unbiased under equal variances",
+    "HC3": "e²/(1 − h)², nearly the jackknife",
 }
+POWERS = {"0": 0.0, "1": 0.0, "2": -0.5, "3": -1.0}  # of I − Q_cQ_cᵀ in A_c
 
 
 Rows = tuple[Array, Array, NDArray[Any]]  # Q_c and e_c of whole clusters, and the cluster of each
@@ -218,7 +222,7 @@ def clustered(
     meat, outer, alone = np.zeros((p, p)), np.zeros((p, p, p)), np.zeros(p, dtype=bool)
     lone: list[Any] = []
     size, trace, square = np.zeros((3, p))  # Σ aᵀa, tr Γ and tr Γ²
-    of_rows, (power, said) = kind[0] == "H", POWERS[kind[-1]]
+    of_rows, power = kind[0] == "H", POWERS[kind[-1]]
     for Q, e, cluster in parts:
         n, G = n + len(e), G + len(np.unique(cluster))
         # Clusters of one size, in blocks of bounded memory.
@@ -254,7 +258,7 @@ def clustered(
     if kind[-1] == "1":
         meat *= G / (G - 1) * (n - 1) / (n - p)
     what = "each row its own variance" if of_rows else f"rows correlated within {G} clusters"
-    text = f"{what}, {said.format('rows' if of_rows else 'clusters')}"
+    text = f"{what}, {DESCRIPTION[kind]}"
     square = square + (outer**2).sum(axis=(1, 2))
     told = (trace > 1e-9 * size) & (square > 0) & ~alone  # the residual says something of it
     dof = np.where(told, trace**2 / np.where(told, square, 1.0), 0.0)

@@ -198,11 +198,8 @@ class Model(ByValue):
 
     def _read(self, path: str | Path | DataFrame, observe: str) -> Measurements:
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
-        source, text = path, None
-        if not isinstance(path, str | Path):
-            source, text = "DataFrame", path.to_csv(index=any(path.index.names))
         return read_measurements(
-            source, joint_kinds=self.chain.kinds, marker_names=markers, observe=observe, text=text
+            path, joint_kinds=self.chain.kinds, marker_names=markers, observe=observe
         )
 
     @checked_arguments

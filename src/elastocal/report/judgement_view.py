@@ -14,6 +14,7 @@ from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.noise_summary import Noise, NoiseSize, ResidualSummary
 from elastocal.identification.result import Calibration, Finding
+from elastocal.identification.start import ROBUST
 from elastocal.messages import gathered, listed, option, printable, rounded, some
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
@@ -496,7 +497,8 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     name = printable(finding.moves_most)
     if not math.isfinite(finding.influence):
         return f"{text}; the other readings leave {name} undetermined."
-    moves = "fitted along they would move" if apart else "in the fit they move"
+    bends = not apart and method_of(result) not in ROBUST  # readings of full weight in the fit
+    moves = "in the fit they move" if bends else "fitted along they would move"
     count = say.significant(finding.influence, 2)
     return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
 
