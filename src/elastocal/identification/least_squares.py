@@ -319,7 +319,8 @@ def held_out_by_parts(
     `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
     the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
     step to the linear model's minimum, where x is not it."""
-    held, leverage, left = np.ones((3, len(problem.observations.value)))
+    held, leverage = np.empty((2, len(problem.observations.value)))
+    left = np.broadcast_to(1.0, len(held)) if problem.large else np.empty(len(held))
     together, size = problem.weights.together, problem.observations.size
 
     def leave_out(part: Problem) -> None:
