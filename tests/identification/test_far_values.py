@@ -232,8 +232,15 @@ def test_pairs_of_mistakes(made):
 def test_one_row_that_closed_up_lets_markers_change_places(made):
     path, table = made
     left = np.delete(table.position, 31, axis=0)
-    found = refusal(path, replace(table.take(np.arange(len(left))), position=left))
+    found = refusal(path, replace(table.take(np.arange(101)), position=left))
     assert "line 33" in found and "one row later" in found
+
+
+def test_a_tracker_that_was_moved_is_told_by_the_lines_it_read_from_there(made):
+    path, table = made
+    moved = np.vstack([table.position[:51], table.position[51:, [1, 0, 2]] * [1, -1, 1] + 3])
+    found = refusal(path, replace(table, position=moved))
+    assert "from line 53 on they stand in another frame" in found
 
 
 def test_a_column_that_holds_one_value_is_named(made):

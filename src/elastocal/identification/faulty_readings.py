@@ -408,3 +408,39 @@ def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, .
             "Exchange the names in these rows."
         )
     return rows, markers, words
+
+
+# Runs of rows in frames of their own: the tracker stood elsewhere, or the arm did.
+
+CONVERT = "Measure common points from each station to convert them, or give each part by itself"
+
+
+def in_one_frame(model: Model, table: Measurements) -> tuple[str, Measurements] | None:
+    """The table with runs of rows that fit the nominal arm each in a frame of its own brought into
+    that of the first, after words that say so, {} being what it then fits to; None where there are
+    no such runs.  `table` has positions."""
+    flange, position = model.rigid.flange_poses(table), np.array(table.position)
+    visit = np.cumsum(np.r_[True, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
+    starts, of = [0], list[Registration]()
+    while (first := starts[-1]) < len(table):
+        end = int(np.searchsorted(visit, visit[first] + FEWEST_POSES))
+        for _ in range(2):  # of few poses, then of all that these have found
+            found = Registration.of(model, table.take(np.arange(first, end)))
+            places = found.places(flange[first:], table.marker[first:])
+            off = np.linalg.norm(table.position[first:] - places, axis=1) > POOR
+            # So that least of the run is off, and least of what follows is not.
+            end = first + int(np.cumsum(np.r_[0, 2 * off - 1]).argmin())
+            if end == first or visit[end - 1] - visit[first] + 1 < FEWEST_POSES:
+                return None
+        of.append(found)
+        back = (position[first:end] - found.translation) @ found.rotation
+        position[first:end] = back @ of[0].rotation.T + of[0].translation
+        starts.append(end)
+    if len(of) == 1:
+        return None
+    words = (
+        f"from {listed([f'line {line}' for line in table.row[starts[1:-1]]])} on they stand in "
+        "another frame, as of a tracker that was moved; brought into the first they would fit to "
+        f"{{}}. {CONVERT}"
+    )
+    return words, replace(table, position=position)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.identification import mistakes, noise_summary
-from elastocal.identification.faulty_readings import exchanged
+from elastocal.identification.faulty_readings import CONVERT, POOR, exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
@@ -396,7 +396,9 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
             lines = [o.line for o in result.excluded]
             sound = result.observations.table.row[result.observations.lead]
             if min(lines) > sound.max() or max(lines) < sound.min():
-                remedy += " All stand at one end of the table, as after a jump: ask diagnose."
+                remedy += " All stand at one end of the table, as after "
+                far = np.median([o.residual for o in result.excluded]) > POOR
+                remedy += f"the tracker was moved. {CONVERT}." if far else "a jump: ask diagnose."
         numbers = {"left_out": gone, "heldout_all_rms_um": result.heldout_all_rms}
         numbers["shifted"] = sum(len(f.readings) for f in shifted)
         yield _note("faulty_readings", remedy, fitted=kept, **numbers)

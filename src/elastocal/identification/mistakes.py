@@ -22,7 +22,13 @@ import scipy  # whose `spatial` loads where rotations were read
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import Convention, ModelSpec, Tool
-from elastocal.identification.faulty_readings import FEWEST_POSES, MOST, POOR, exchanged
+from elastocal.identification.faulty_readings import (
+    FEWEST_POSES,
+    MOST,
+    POOR,
+    exchanged,
+    in_one_frame,
+)
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
 from elastocal.identification.start import (
@@ -409,6 +415,8 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
     visits, rows = int(visit[-1]) + 1, np.arange(len(table))
     if visits < BLOCK or len(table) > MOST_ROWS:
         return
+    if moved_on := in_one_frame(model, table):
+        yield moved_on
     most = FARTHEST_ROW * max(round(len(table) / visits), 1)
     shifts, flange = np.arange(-most, most + 1), nominal_flanges(model.chain, table.q)
     to = rows[:, None] + shifts
