@@ -427,7 +427,7 @@ def in_one_frame(model: Model, table: Measurements) -> tuple[str, Measurements] 
         for _ in range(2):  # of few poses, then of all that these have found
             found = Registration.of(model, table.take(np.arange(first, end)))
             places = found.places(flange[first:], table.marker[first:])
-            off = np.linalg.norm(table.position[first:] - places, axis=1) > POOR
+            off = np.linalg.norm(position[first:] - places, axis=1) > POOR
             # So that least of the run is off, and least of what follows is not.
             end = first + int(np.cumsum(np.r_[0, 2 * off - 1]).argmin())
             if end == first or visit[end - 1] - visit[first] + 1 < FEWEST_POSES:
