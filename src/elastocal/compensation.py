@@ -242,6 +242,7 @@ class Compensation(Result):
         turn: (n, 2), the same two for the rotation, in rad.
         status: (n,), of "reached", "limit", "no equilibrium" and "not reached".
         uncertainty: Of the tool's position, NaN where a row is not reached.
+        turn_uncertainty: Of its rotation where targets are `oriented`, else None.
         warnings: What to know before one runs the commands, in sentences.
         targets: The targets as given.
         point: The tool's point.
@@ -275,6 +276,7 @@ class Compensation(Result):
     T_flange_tool: Array
     nominal_miss: Array
     uncertainty: Uncertainty
+    turn_uncertainty: Uncertainty | None
     warnings: tuple[str, ...]
 
     def __repr__(self) -> str:
@@ -343,11 +345,12 @@ def compensate(
         q, after = search.commands(q, every)
     before, reached = search.misses(nominal, every), _is_reached(after)
     progress("uncertainty")
+    sure = _uncertainty(tool, search.rows, q, reached)
+    of_turn = _uncertainty(tool, search.rows, q, reached, turns=True) if oriented else None
     result = Compensation(
         chain, targets, point, q, nominal, before[:, 0], after[:, 0],
         np.column_stack([before[:, 1], after[:, 1]]), _status(search, after, nominal), goals,
-        oriented, force, T, placed, task.errors(nominal, every)[0],
-        _uncertainty(tool, search.rows, q, reached), (),
+        oriented, force, T, placed, task.errors(nominal, every)[0], sure, of_turn, (),
     )  # fmt: skip
     told = [*_of_loads(arm, result), *_of_places(arm, result)]
     if targets.path or targets.q is None:  # not of a grid of joints
@@ -412,9 +415,9 @@ def _status(search: Commanding, missed: Array, nominal: Array) -> tuple[str, ...
 
 
 def _uncertainty(
-    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: BoolArray
+    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: BoolArray, turns: bool = False
 ) -> Uncertainty:
-    some = uncertainty_at(tool, [values[reached] for values in rows], q[reached])
+    some = uncertainty_at(tool, [values[reached] for values in rows], q[reached], turns)
     at = np.where(reached, np.cumsum(reached) - 1, -1)  # -1: the row of NaN behind them
     known = some.covariance, some.total, some.unknown
     of_all = [np.concatenate([v, np.full((1, *v.shape[1:]), np.nan)])[at] for v in known]
@@ -426,7 +429,7 @@ AT_LIMIT = 1e-4  # rad or m; a controller stops before it
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
 LARGE_CORRECTION = np.radians(2.0)  # rad (or m) of a joint
 LEVEL_SLACK = 0.01  # rad or m
-WORTH_TELLING = 10e-6  # m
+WORTH_TELLING = 10e-6  # m or rad
 UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
 
 
@@ -479,16 +482,21 @@ def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
 
 
 def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
-    sure, reached = c.uncertainty, c.reached
-    unknown, std = sure.unknown[reached], sure.std[reached]
-    rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
-    if len(unknown) and rms > max(WORTH_TELLING, float(np.sqrt(np.mean(std**2)))):
+    sure, turn, reached = c.uncertainty, c.turn_uncertainty, c.reached
+    if (rms := _open(sure, reached)) is not None:
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
             f"this point depends: typical deviations of them would move it by {length(rms)} rms, "
             "which within95_um counts and std_um leaves out; "
             + f"choose a marker that was fitted ({option('point')}), or " * (not c.point.marker)
             + "measure what is missing"
+        )
+    if turn is not None and (rms := _open(turn, reached)) is not None:
+        yield (
+            f"The data do not determine {listed(turn.blamed, 4)}, on which the tool's rotation "
+            f"depends: typical deviations of them would turn it by {rounded(rms * 1e6)} µrad rms, "
+            "which std_rotation_urad leaves out; where rotations matter, measure full poses or "
+            "further markers"
         )
     known = np.isin(arm.model.names, arm.determined)
     for group in smooth_groups(arm.model):
@@ -520,6 +528,13 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         most, at_poses = length(sure.std[which].max(initial=0.0)), length(shown.most)
         sizes = f"(standard deviation {most} at most, at measured poses {at_poses})"
         yield from _told(c.targets, which, f"{told} {sizes}; {remedy}")
+
+
+def _open(sure: Uncertainty, reached: BoolArray) -> float | None:
+    """Rms of what parameters left open would do, where it is more than all that is known of."""
+    rms, known = (float(np.sqrt((v[reached] ** 2).sum() / max(reached.sum(), 1)))
+                  for v in (sure.unknown, sure.std))  # fmt: skip
+    return rms if rms > max(WORTH_TELLING, known) else None
 
 
 MARKERS_ASKED = 3  # of those on one tool one is as good as another
@@ -603,6 +618,8 @@ def commands_csv(result: Compensation) -> str:
         blocks.append((heads, result.turn * 1e6, ".4g"))
     sure = np.column_stack([result.uncertainty.std, result.uncertainty.within]) * 1e6
     blocks.append((["std_um", "within95_um"], sure, ".4g"))
+    if (turn := result.turn_uncertainty) is not None:
+        blocks.append((["std_rotation_urad"], turn.std[:, None] * 1e6, ".4g"))
     labels = [table.configuration_labels[code] for code in table.configuration]
     return table_csv(blocks, result.status, configuration=labels)
 
@@ -647,6 +664,8 @@ def summary(result: Compensation, commands: bool) -> dict[str, Any]:
         "undetermined": list(result.uncertainty.blamed),
         "warnings": list(result.warnings),
     }  # fmt: skip
+    if (turn := result.turn_uncertainty) is not None:
+        content["std_rotation_urad"] = spread(turn.std[good])
     if commands:
         q = in_file_units(result.q, kinds)
         content["commands"] = [

@@ -153,13 +153,14 @@ def test_uncertainty_is_what_other_values_would_do():
     std = np.sqrt(np.diag(arm.covariance))
     rows = arm.model.table(found.q)
     rows = replace(rows, force=found.force, marker=0 * rows.configuration)
-    off = []
+    off, turned = [], []
     for step in np.diag(std):
-        ends = (arm.model.target_poses(rows, arm.x + way * step)[1] for way in (1, -1))
-        off.append((next(ends) - next(ends)) / 2)
-    expected = np.sqrt((np.array(off) ** 2).sum(axis=(0, 2)))
-    assert np.allclose(found.uncertainty.std, expected, rtol=1e-3)
-    assert not found.uncertainty.blamed
+        one, other = (arm.model.target_poses(rows, arm.x + way * step) for way in (1, -1))
+        off.append((one[1] - other[1]) / 2)
+        turned.append(Rotation.from_matrix(one[0] @ other[0].transpose(0, 2, 1)).as_rotvec() / 2)
+    for sure, moves in ((found.uncertainty, off), (found.turn_uncertainty, turned)):
+        expected = np.sqrt((np.array(moves) ** 2).sum(axis=(0, 2)))
+        assert np.allclose(sure.std, expected, rtol=1e-3) and not sure.blamed
 
 
 def test_targets_far_from_what_was_measured_are_told_and_a_point_known_worse_is_the_reason():
@@ -190,6 +191,7 @@ def test_what_no_marker_showed_is_told():
     place = commanded(arm, at_postures(None), "0.1,0.2,0.3")
     assert np.all(place.uncertainty.unknown > 1e-3)
     assert any("link6." in told and "`point`" in told for told in place.warnings)
+    assert any("link6." in told and "rotation" in told for told in place.warnings)
 
 
 # Paths

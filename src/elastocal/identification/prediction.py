@@ -50,7 +50,7 @@ NONE_OPEN = OpenParameters((), np.zeros((0, 0)), np.zeros(0))
 @dataclass(frozen=True)
 class Uncertainty:
     """`covariance` (n, 3, 3) m² of the position in the data's frame; `total` (n, 3, 3) with
-    parameters left open and lack of fit.
+    parameters left open and lack of fit.  Of a rotation in rad², where no lack of fit is known.
 
     `unknown` (n,) m: what typical deviations of the parameters that the data do not determine
     would move the tool by, which the covariance does not hold; `blamed` names those parameters,
@@ -73,13 +73,15 @@ class Uncertainty:
         return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2)))
 
 
-def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncertainty:
+def uncertainty_at(
+    tool: CalibratedTool, rows: list[NDArray], q: Array, turns: bool = False
+) -> Uncertainty:
     """Σ_p = A_K Σ A_Kᵀ and O S at commanded joints q (n, joints) under the inputs `rows`; NaN where
-    the result determined nothing."""
+    the result determined nothing.  `turns`: of the rotation instead of the position."""
     arm, known, off = tool.calibrated, [], []
     for first in range(0, len(q), SENSITIVITIES):
         some = slice(first, first + SENSITIVITIES)
-        at = moves(arm, tool.sensitivity([values[some] for values in rows], q[some]))
+        at = moves(arm, tool.sensitivity([values[some] for values in rows], q[some], turns))
         known.append(at[0] @ arm.covariance @ at[0].transpose(0, 2, 1))
         off.append(at[1])
     if not off:
@@ -88,9 +90,10 @@ def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncer
     if not arm.determined:  # nothing known is no certainty
         covariance = np.full((len(q), 3, 3), np.nan)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+    lacking = 0.0 if turns else arm.lacking
     return Uncertainty(
         covariance,
-        covariance + move @ move.transpose(0, 2, 1) + arm.lacking**2 / 3 * np.eye(3),
+        covariance + move @ move.transpose(0, 2, 1) + lacking**2 / 3 * np.eye(3),
         np.sqrt((move**2).sum(axis=(1, 2))),
         _blamed(arm.left or NONE_OPEN, (move**2).sum(axis=1).mean(axis=0)),
     )

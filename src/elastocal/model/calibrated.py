@@ -528,6 +528,7 @@ class CalibratedTool:
         y = ca.vertcat(position, rigid.ARM_LENGTH * tilt)
         self._placing = Total(self._symbolic, position, q)
         self._turning = Total(self._symbolic, y, q, (turned,))
+        self._tilting = Total(self._symbolic, tilt, p, (turned,))
         frames = [own.T_tracker_base, rigid.transform(turn, place)]
         self._frames = BatchFunction([*own.inputs.values(), p], frames, self._symbolic.backend)
 
@@ -564,9 +565,13 @@ class CalibratedTool:
         y = self._pose(self._at(rows, q), self.x)[0]
         return y[:, :3], y[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
 
-    def sensitivity(self, rows: list[NDArray], q: Array) -> Array:
-        """A (n, 3, parameters) = d(position)/dX in m per unit, at commanded joints q."""
-        return self._sensitivity(self._at(rows, q), self.x)[1]
+    def sensitivity(self, rows: list[NDArray], q: Array, turns: bool = False) -> Array:
+        """A (n, 3, parameters) = d(position)/dX in m per unit, at commanded joints q; `turns`: that
+        of the rotation in rad."""
+        if not turns:
+            return self._sensitivity(self._at(rows, q), self.x)[1]
+        turned = self.poses(rows, q)[1].transpose(0, 2, 1).reshape(-1, 9)
+        return self._tilting(self._at(rows, q), self.x, [turned])[1]
 
     def errors(
         self, rows: list[NDArray], q: Array, position: Array, rotation: Array | None

@@ -18,7 +18,7 @@ from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.measurements import in_file_units, joint_columns, numbered
-from elastocal.messages import InputError, listed, load_text, printable, some
+from elastocal.messages import InputError, listed, load_text, printable, rounded, some
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import identification_view as fitted
@@ -174,6 +174,8 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
         yield say.Sentence(
             "Within counts possible model error and what the readings leave open as well."
         )
+        if (turn := commands.get("std_rotation_urad", {}).get("rms")) is not None:
+            yield say.Sentence(f"Standard uncertainty of the rotation: {rounded(turn)} µrad rms.")
         for k, command in enumerate(commands.get("commands", ())):
             joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
             yield say.Sentence(f"target {k + 1}: {joints or command['status']}")
