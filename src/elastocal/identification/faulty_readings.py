@@ -25,7 +25,7 @@ from elastocal.identification.outliers import (
     prior_widths,
 )
 from elastocal.identification.solve import Solution
-from elastocal.identification.start import Registration
+from elastocal.identification.start import FITS, Registration
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.measurements import Measurements
 from elastocal.messages import length, listed
@@ -348,7 +348,6 @@ def report_faulty(
 # is not its marker's.  Where each of two markers lies where the cell states the other, the majority
 # has them exchanged: the sums of squares of both, three numbers a marker, are compared by F.
 
-POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
 MOST = 80  # % of the readings, which what they fit to is told of
 FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
 MOST_READINGS, PASSES = 200_000, 10
@@ -378,7 +377,7 @@ def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, .
         before, marker = marker, np.where(other, nearest, table.marker)
         if np.array_equal(marker, before):
             break
-    if np.percentile(distance[row, marker], MOST) > POOR:
+    if np.percentile(distance[row, marker], MOST) > FITS:
         return None  # of an arm that fits nowhere readings lie near another marker by chance
     best, places, known = np.arange(len(names)), found.markers, model.cell.tool.markers
     pairs = list(combinations([m for m, name in enumerate(names) if name in known], 2))
@@ -427,7 +426,7 @@ def in_one_frame(model: Model, table: Measurements) -> tuple[str, Measurements] 
         for _ in range(2):  # of few poses, then of all that these have found
             found = Registration.of(model, table.take(np.arange(first, end)))
             places = found.places(flange[first:], table.marker[first:])
-            off = np.linalg.norm(position[first:] - places, axis=1) > POOR
+            off = np.linalg.norm(position[first:] - places, axis=1) > FITS
             # So that least of the run is off, and least of what follows is not.
             end = first + int(np.cumsum(np.r_[0, 2 * off - 1]).argmin())
             if end == first or visit[end - 1] - visit[first] + 1 < FEWEST_POSES:

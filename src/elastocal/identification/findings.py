@@ -12,13 +12,14 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.identification import mistakes, noise_summary
-from elastocal.identification.faulty_readings import CONVERT, POOR, exchanged
+from elastocal.identification.faulty_readings import CONVERT, exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.result import Calibration, Finding, made, more_poses
 from elastocal.identification.solve import Solution
+from elastocal.identification.start import FITS
 from elastocal.measurements import Measurements, numbered, told_of_rounding
 from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of
 from elastocal.model.calibrated import MOSTLY, mostly_prior
@@ -397,7 +398,7 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
             sound = result.observations.table.row[result.observations.lead]
             if min(lines) > sound.max() or max(lines) < sound.min():
                 remedy += " All stand at one end of the table, as after "
-                far = np.median([o.residual for o in result.excluded]) > POOR
+                far = np.median([o.residual for o in result.excluded]) > FITS
                 remedy += f"the tracker was moved. {CONVERT}." if far else "a jump: ask diagnose."
         numbers = {"left_out": gone, "heldout_all_rms_um": result.heldout_all_rms}
         numbers["shifted"] = sum(len(f.readings) for f in shifted)

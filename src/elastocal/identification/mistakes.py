@@ -25,13 +25,13 @@ from elastocal.cell_tables import Convention, ModelSpec, Tool
 from elastocal.identification.faulty_readings import (
     FEWEST_POSES,
     MOST,
-    POOR,
     exchanged,
     in_one_frame,
 )
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
 from elastocal.identification.start import (
+    FITS,
     OF_A_TARGET,
     OF_A_UNIT,
     SCALED,
@@ -102,7 +102,7 @@ def nominal_fit(
         mixed = exchanged(Model.assembled(chain, replace(cell, model=ModelSpec())), table)
         if mixed is not None:
             return NominalFit(error, mixed[2].removesuffix("."), True)
-    if far <= POOR:
+    if far <= FITS:
         return NominalFit(error, rotations_off(rigid, table, "the nominal arm"))
     near, best = far, ""
     # The simplest that mends it, else what does most.
@@ -113,7 +113,7 @@ def nominal_fit(
         left = _errors(arm, other)[1]
         if left < near:
             near, best = left, words.format(length(left))
-        if near <= POOR:
+        if near <= FITS:
             break
     better = near < far / BETTER
     if not better:
@@ -123,7 +123,7 @@ def nominal_fit(
             "the cell, offsets of joints, and which joint values belong to which point"
         )
     said = f"the readings fit the nominal arm only to {length(far)}"
-    return NominalFit(error, f"{said}{';' if better else ','} {best}", better and near <= POOR)
+    return NominalFit(error, f"{said}{';' if better else ','} {best}", better and near <= FITS)
 
 
 def likely_mistake(model: Model, table: Measurements) -> str:
@@ -357,7 +357,7 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
                 other = replace(table, q=q[k], position=undone)
                 found.append((float(fits.left[k]), count, words, other))
     found.sort(key=lambda one: one[0])
-    likely = [one for one in found if one[0] <= POOR] or found[:2]
+    likely = [one for one in found if one[0] <= FITS] or found[:2]
     likely.sort(key=lambda one: one[1])  # of equally many mistakes the better fit stays first
     for left, _, words, other in likely[:CONFIRMED]:
         told = " and ".join(words)
@@ -518,7 +518,7 @@ def _placed(model: Model, table: Measurements) -> bool:
     flange = model.rigid.flange_poses(some)
     found = LinearFits(flange[None], np.asarray(some.position), some.marker)
     rigid = found.determinant[0] > 0 and abs(found.scale[0] - 1) < OF_A_UNIT
-    return bool(rigid and found.left[0] <= POOR)
+    return bool(rigid and found.left[0] <= FITS)
 
 
 def refuse_nonsense(
@@ -544,7 +544,7 @@ def refuse_nonsense(
     beyond = [(p.name, v) for p, v in zip(model.parameters, x, strict=True)
               if p.unit == "m" and not abs(v) <= LARGEST * (length + reach)]  # fmt: skip
     # A joint whose values were not recorded may move the markers by less than that.
-    most = POOR if (every.q == every.q[0]).all(axis=0).any() else np.inf
+    most = FITS if (every.q == every.q[0]).all(axis=0).any() else np.inf
     sane = max(fitted) <= min(POOREST * length, most) and share <= FEW and not beyond
     if turned.size and np.median(turned) > POOREST and (sane or _placed(model, every)):
         rigid = _rigid(model.chain, model.cell, every)

@@ -524,7 +524,7 @@ def _unit_of(
     return next(near, None) if found.left[0] < ALIKE * reach else None
 
 
-FITS = 0.03  # m, which nominal arms keep to the positions of their readings
+FITS = 0.03  # m, which nominal arms keep to their readings; wrong signs and units are far more
 FAR_OFF = 10.0  # times the median, which is more than any noise is
 
 
