@@ -240,33 +240,11 @@ def diagnose(
 def _diagnosed(
     model: Model, table: Measurements, options: DiagnosisOptions, progress: Progress
 ) -> Diagnosis:
-    given, source = model, table.source
-    check_table(model, table, likely_mistake)
-    if (n := len(np.unique(table.configuration))) < FEWEST:
-        raise InsufficientDataError(
-            f"{source}: {n} configurations are too few to tell a missing effect from noise; "
-            f"measure {FEWEST} at least, better 30 or more"
-        )
-    table, told = without_copies(table)
-    told = (*told, *past_midnight(table))
-    table, left_out = thinned(table)
-    model = with_recorded_drivers(model, table)
-    progress("fitting the model as it is")
-    base = fit_baseline(model, table, options.seed)
-    if blocks := _misread(base, table, options.seed):
-        gone = np.isin(table.row, np.concatenate([g.lines for g in blocks]))
-        told = (*told, MISREAD.format(listed(map(str, blocks), 4), int(gone.sum()), len(gone)))
-        table = table.take(~gone)
-        base = fit_baseline(model, table, options.seed)
-    if lines := _far_off(base, table, options.seed):
-        runs = listed(named_runs(lines), 8)
-        told = (*told, FAR_OFF.format(counted(len(lines), "reading"), runs))
-        table = table.take(~np.isin(table.row, lines))
-        base = fit_baseline(model, table, options.seed)
-    if disordered := order_contradicted(table):
-        told = (*told, disordered + OUT_OF_ORDER)
+    base, left, told = _fitted(model, table, options.seed, progress)
+    if disordered := order_contradicted(left):
+        told.append(disordered + OUT_OF_ORDER)
         options = replace(options, without=(*options.without, *BY_LAST_MOVE))
-    hypotheses, untested = possible(model, table, options.without)
+    hypotheses, untested = possible(base.model, left, options.without)
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
@@ -297,17 +275,45 @@ def _diagnosed(
         untested=(*untested, *small),
         warnings=(
             *told,
-            *filter(None, [left_out, solved_body(table, float(base.residual.std())), turned]),
+            *filter(None, [solved_body(left, float(base.residual.std())), turned]),
             *warnings(dataset, found, suspects, answers["noise"]),
             *confirm(unheard_of(answers["effects"], base.model)),
         ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
         model_keys=model_keys(base.model, added),
-        model=given,
-        data=source,
+        model=model,
+        data=table.source,
         calibrated=base,
     )
+
+
+def _fitted(
+    model: Model, table: Measurements, seed: int, progress: Progress
+) -> tuple[Baseline, Measurements, list[str]]:
+    """The model as it is, the readings that it is fitted to, and why others are left out."""
+    check_table(model, table, likely_mistake)
+    if (n := len(np.unique(table.configuration))) < FEWEST:
+        raise InsufficientDataError(
+            f"{table.source}: {n} configurations are too few to tell a missing effect from noise; "
+            f"measure {FEWEST} at least, better 30 or more"
+        )
+    table, copies = without_copies(table)
+    told = [*copies, *past_midnight(table)]
+    table, left_out = thinned(table)
+    model = with_recorded_drivers(model, table)
+    progress("fitting the model as it is")
+    base = fit_baseline(model, table, seed)
+    if blocks := _misread(base, table, seed):
+        gone = np.isin(table.row, np.concatenate([g.lines for g in blocks]))
+        told.append(MISREAD.format(listed(map(str, blocks), 4), int(gone.sum()), len(gone)))
+        table = table.take(~gone)
+        base = fit_baseline(model, table, seed)
+    if lines := _far_off(base, table, seed):
+        told.append(FAR_OFF.format(counted(len(lines), "reading"), listed(named_runs(lines), 8)))
+        table = table.take(~np.isin(table.row, lines))
+        base = fit_baseline(model, table, seed)
+    return base, table, [*told, *filter(None, [left_out])]
 
 
 # What stands for a while and goes again has no effect of the catalogue; what stays has.
