@@ -418,7 +418,7 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "output": None if output is None else str(output),
         "readings": len(table),
         "configurations": len(table.configuration_labels),
-        "markers": list(table.marker_names),
+        "markers": list(table.markers_read),
         "columns": list(found.columns),
         "joined_by": None if joined is None else joined.how,
         "left_out": [] if joined is None else list(joined.left_out),

@@ -440,8 +440,9 @@ def _unread(result: Calibration) -> list[str]:
 
 def no_reading(result: Calibration) -> str:
     names = [place.removeprefix("marker:") for place in _unread(result)]
-    several, source = "s" * (len(names) > 1), result.observations.table.source
-    return f"no reading of marker{several} {listed(names, 4)} in {source}"
+    s, itself = ("s", "themselves") if len(names) > 1 else ("", "itself")
+    source = result.observations.table.source
+    return f"no reading of marker{s} {listed(names, 4)} {itself} in {source}"
 
 
 def standings(result: Calibration) -> dict[str, str]:

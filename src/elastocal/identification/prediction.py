@@ -181,7 +181,7 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
 
 def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:
     """Places "marker:M2" of the markers that no row reads."""
-    read = {f"marker:{table.marker_names[m]}" for m in np.unique(table.marker)}
+    read = {f"marker:{name}" for name in table.markers_read}
     places = dict.fromkeys(p.where for p in model.parameters if p.where.startswith("marker:"))
     return tuple(place for place in places if place not in read)
 

@@ -356,8 +356,10 @@ class Estimable:
     def remaining_bias(self, A: Array, weight: Array) -> float:
         """Rms in m by which typical deviations of held parameters move the test points, A (T, r,
         parameters) with `weight` (T,)."""
-        off = self._unexplained(A, self.reduction)
-        return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
+        return float(np.sqrt(weight @ (self.held(A) ** 2).sum(axis=(1, 2))))
+
+    def held(self, A: Array) -> Array:
+        return self._unexplained(A, self.reduction)
 
     def _unexplained(self, A: Array, r: Reduction) -> Array:
         """(T, r, dropped): A_D − A_K · mixing, times the sizes."""

@@ -94,7 +94,8 @@ class Setup:
     of: `inputs` of the test poses alone, and `beyond`, ∂position/∂parameters (T, r, p) at poses all
     over the joint ranges and their weights (T,), on which `share` of the criterion's weight lies.
     `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one.
-    `pinned`: poses that stay, which every problem knows before."""
+    `pinned`: poses that stay, which every problem knows before.  `held` (T, r, d): by how much
+    typical deviations of what is held move the test points."""
 
     information: PoseInformation
     found: Estimable
@@ -105,6 +106,7 @@ class Setup:
     ways: IntArray
     share: float = 0.0
     pinned: FeasiblePool | None = None
+    held: Array | None = None
 
     @cached_property
     def criterion(self) -> ScenarioCriterion:
@@ -233,7 +235,8 @@ def _aimed(
             "over the joint ranges, but the rules allow none, or no plan can make all of them "
             "certain; leave it out"
         )
-    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=setup.warnings + told)
+    held, told = found.held(rows[:T]), setup.warnings + told
+    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=told, held=held)
 
 
 # The weight of what lies elsewhere, from the price that the test poses may pay for it.
