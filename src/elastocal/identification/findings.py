@@ -16,7 +16,7 @@ from elastocal.identification.faulty_readings import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
-from elastocal.identification.prediction import unread_markers
+from elastocal.identification.prediction import anywhere, unread_markers
 from elastocal.identification.result import Calibration, Finding, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.measurements import Measurements, numbered, told_of_rounding
@@ -522,7 +522,12 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
     if singular[0] > ILL_CONDITIONED * singular[-1]:
         worst = tuple(result.determined[own[i]] for i in np.argsort(-np.abs(Vt[-1]))[:3])
         condition = float(singular[0] / singular[-1])
-        yield _note("ill_conditioned", condition_number=condition, parameters=worst)
+        remedy = None
+        if (B := anywhere(solution)) is not None:
+            B = B[:, reduction.kept[own]]
+            if np.linalg.cond(B / np.maximum(np.linalg.norm(B, axis=0), EXACT)) > ILL_CONDITIONED:
+                remedy = "Fix one of these: no poses separate them better under these loads."
+        yield _note("ill_conditioned", remedy, condition_number=condition, parameters=worst)
 
 
 def _bounds(result: Calibration) -> Iterator[Finding]:
