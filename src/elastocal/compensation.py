@@ -512,12 +512,10 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     surest[far] = _std_of_markers(arm, c, far)
     outside = far & (surest > shown.most)
     outside &= shown.chance(int(outside.sum()), n) < UNLIKELY
-    several = outside.sum() > 1
     for which, std, told, remedy in (
         (far & ~outside, sure.std, f"where the {c.point.told} lies on the tool is hardly known",
          f"measure a marker there, or choose a marker that was fitted ({option('point')})"),
-        (outside, surest, f"{'these targets are' if several else 'this target is'} outside the "
-         "measured poses", "measure poses there"),
+        (outside, surest, "outside the measured poses", "measure poses there"),
     ):  # fmt: skip
         most, at_poses = length(std[which].max(initial=0.0)), length(shown.most)
         sizes = f"(standard deviation {most} at most, at measured poses {at_poses})"

@@ -425,11 +425,8 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "left_out": [] if joined is None else list(joined.left_out),
         "poses_without_point": [] if joined is None else list(joined.unused),
         "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
-        "files": [
-            observed
-            | {"ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]]}
-            for observed in found.understood
-        ],
+        "files": [one | {"ignored": [{"line": n, "reason": why} for n, why in one["ignored"]]}
+                  for one in found.understood],
         "warnings": list(found.warnings),
         "refused": found.refused or None,
     }  # fmt: skip

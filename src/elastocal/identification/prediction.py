@@ -163,8 +163,7 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     B *= np.where(typical > 0, typical, 1.0)
     # A marker that nobody read is no matter of poses.
     unread = unread_markers(model, observed.table)
-    read = np.array([model.parameters[c].where not in unread for c in open_], dtype=bool)
-    open_ = open_[read]
+    open_ = open_[[model.parameters[c].where not in unread for c in open_]]
     if not len(open_):
         return ()
     both = np.concatenate([kept[~model.shrunk[kept]], open_])
