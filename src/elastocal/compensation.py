@@ -513,19 +513,19 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         )  # fmt: skip
     if (shown := arm.shown) is None or arm.model.observe == "distance":
         return
-    far = reached & (sure.std > shown.most)
-    if shown.chance(int(far.sum()), int(reached.sum())) >= UNLIKELY:
+    far, n = reached & (sure.std > shown.most), int(reached.sum())
+    if shown.chance(int(far.sum()), n) >= UNLIKELY:
         return
-    outside = far.copy()
-    outside[far] = _std_of_markers(arm, c, far) > shown.most
-    several = outside.sum() > 1
-    for which, told, remedy in (
-        (far & ~outside, f"where the {c.point.told} lies on the tool is hardly known",
+    surest = sure.std.copy()
+    surest[far] = _std_of_markers(arm, c, far)
+    outside = far & (surest > shown.most)
+    outside &= shown.chance(int(outside.sum()), n) < UNLIKELY
+    for which, std, told, remedy in (
+        (far & ~outside, sure.std, f"where the {c.point.told} lies on the tool is hardly known",
          f"measure a marker there, or choose a marker that was fitted ({option('point')})"),
-        (outside, f"{'these targets are' if several else 'this target is'} outside the measured "
-         "poses", "measure poses there"),
+        (outside, surest, "outside the measured poses", "measure poses there"),
     ):  # fmt: skip
-        most, at_poses = length(sure.std[which].max(initial=0.0)), length(shown.most)
+        most, at_poses = length(std[which].max(initial=0.0)), length(shown.most)
         sizes = f"(standard deviation {most} at most, at measured poses {at_poses})"
         yield from _told(c.targets, which, f"{told} {sizes}; {remedy}")
 

@@ -141,7 +141,11 @@ class Measurements(Result):
 
     def __repr__(self) -> str:
         said = f"{len(self)} rows, {len(self.configuration_labels)} configurations"
-        return f"<Measurements {self.source}: {said}, markers {', '.join(self.marker_names)}>"
+        return f"<Measurements {self.source}: {said}, markers {', '.join(self.markers_read)}>"
+
+    @property
+    def markers_read(self) -> tuple[str, ...]:
+        return tuple(self.marker_names[k] for k in np.unique(self.marker))
 
     @property
     def kinds(self) -> tuple[str, ...]:

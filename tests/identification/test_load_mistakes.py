@@ -98,7 +98,7 @@ def test_a_marker_without_readings_is_named(made):
     path, table = made
     fit = ec.identify(path, table.take(np.flatnonzero(table.marker == 0)))
     told = " ".join(str(fit).split())
-    source = fit.observations.table.source
-    assert f"There is no reading of marker M2 in {source}: measure it, or delete it from" in told
+    none = f"no reading of marker M2 itself in {fit.observations.table.source}"
+    assert f"There is {none}: measure it, or delete it from" in told
     assert "marker:M2.x" not in "".join(fit.left.redundant)
-    assert f"(no reading of marker M2 in {source}): marker:M2.x, marker:M2.y, marker:M2.z" in told
+    assert f"({none}): marker:M2.x, marker:M2.y, marker:M2.z" in told

@@ -261,7 +261,8 @@ def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str
     if (readings := plan.model.cell.design.repeats) > 1:
         carried += f" --repeats {readings}"
     added = "" if augment is None else f" (add them to {augment})"
-    read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
+    read = "distance_mm" if (kind := plan.model.observe) == "distance" else "x_mm, y_mm, z_mm"
+    read += ", rx_deg, ry_deg, rz_deg (rotation vector)" * (kind == "pose")
     via = f"by the via points of {output.with_suffix('.json')}, " * bool(plan.execution.between)
     text = (
         f"Next: measure {output} in its order, {via}{hung}a row with {read} for each marker{added};"
@@ -418,17 +419,14 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "output": None if output is None else str(output),
         "readings": len(table),
         "configurations": len(table.configuration_labels),
-        "markers": list(table.marker_names),
+        "markers": list(table.markers_read),
         "columns": list(found.columns),
         "joined_by": None if joined is None else joined.how,
         "left_out": [] if joined is None else list(joined.left_out),
         "poses_without_point": [] if joined is None else list(joined.unused),
         "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
-        "files": [
-            observed
-            | {"ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]]}
-            for observed in found.understood
-        ],
+        "files": [one | {"ignored": [{"line": n, "reason": why} for n, why in one["ignored"]]}
+                  for one in found.understood],
         "warnings": list(found.warnings),
         "refused": found.refused or None,
     }  # fmt: skip

@@ -147,7 +147,7 @@ def possible(
     smooth ones, which have their own searches."""
     chain, cell = model.chain, model.cell
     active = {(p.effect, p.where) for p in model.parameters}
-    unread = {f"marker:{n}" for k, n in enumerate(table.marker_names) if k not in table.marker}
+    unread = {f"marker:{n}" for n in table.marker_names if n not in table.markers_read}
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():

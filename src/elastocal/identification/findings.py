@@ -16,7 +16,7 @@ from elastocal.identification.faulty_readings import CONVERT, exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
-from elastocal.identification.prediction import unread_markers
+from elastocal.identification.prediction import anywhere, unread_markers
 from elastocal.identification.result import Calibration, Finding, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.identification.start import FITS
@@ -443,8 +443,9 @@ def _unread(result: Calibration) -> list[str]:
 
 def no_reading(result: Calibration) -> str:
     names = [place.removeprefix("marker:") for place in _unread(result)]
-    several, source = "s" * (len(names) > 1), result.observations.table.source
-    return f"no reading of marker{several} {listed(names, 4)} in {source}"
+    s, itself = ("s", "themselves") if len(names) > 1 else ("", "itself")
+    source = result.observations.table.source
+    return f"no reading of marker{s} {listed(names, 4)} {itself} in {source}"
 
 
 def standings(result: Calibration) -> dict[str, str]:
@@ -524,7 +525,12 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
     if singular[0] > ILL_CONDITIONED * singular[-1]:
         worst = tuple(result.determined[own[i]] for i in np.argsort(-np.abs(Vt[-1]))[:3])
         condition = float(singular[0] / singular[-1])
-        yield _note("ill_conditioned", condition_number=condition, parameters=worst)
+        remedy = None
+        if (B := anywhere(solution)) is not None:
+            B = B[:, reduction.kept[own]]
+            if np.linalg.cond(B / np.maximum(np.linalg.norm(B, axis=0), EXACT)) > ILL_CONDITIONED:
+                remedy = "Fix one of these: no poses separate them better under these loads."
+        yield _note("ill_conditioned", remedy, condition_number=condition, parameters=worst)
 
 
 def _bounds(result: Calibration) -> Iterator[Finding]:

@@ -161,19 +161,12 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     model, observed = problem.model, problem.observations
     if not len(open_) or model.shrunk[kept].all():
         return ()
-    anywhere = over_the_workspace(model.cell, model, observed.table)
-    try:
-        B = readings_at(model, solution.fit.x, observed, anywhere)[0]
-    except ElastocalError:
+    if (B := anywhere(solution)) is None:
         return ()
-    parts = solution.fit.residual.reshape(-1, observed.size)
-    noise = np.sqrt((parts**2).mean(axis=0))[:, None]
-    B = (B / np.maximum(noise, EXACT)).reshape(-1, B.shape[2])
-    B *= np.where(typical > 0, typical, 1.0) * np.sqrt(len(parts) * observed.size / len(B))
+    B *= np.where(typical > 0, typical, 1.0)
     # A marker that nobody read is no matter of poses.
     unread = unread_markers(model, observed.table)
-    read = np.array([model.parameters[c].where not in unread for c in open_], dtype=bool)
-    open_ = open_[read]
+    open_ = open_[[model.parameters[c].where not in unread for c in open_]]
     if not len(open_):
         return ()
     both = np.concatenate([kept[~model.shrunk[kept]], open_])
@@ -182,9 +175,24 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     return tuple(model.names[d] for d in open_[~np.isin(open_, told)])
 
 
+def anywhere(solution: Solution) -> Array | None:
+    """B (rows, parameters) at poses over the whole joint range under the loads of the readings, in
+    units of the noise, as if there were as many readings; None without a static equilibrium."""
+    model, observed = solution.problem.model, solution.problem.observations
+    poses = over_the_workspace(model.cell, model, observed.table)
+    try:
+        B = readings_at(model, solution.fit.x, observed, poses)[0]
+    except ElastocalError:
+        return None
+    parts = solution.fit.residual.reshape(-1, observed.size)
+    noise = np.sqrt((parts**2).mean(axis=0))[:, None]
+    B = (B / np.maximum(noise, EXACT)).reshape(-1, B.shape[2])
+    return np.asarray(B * np.sqrt(parts.size / len(B)))
+
+
 def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:
     """Places "marker:M2" of the markers that no row reads."""
-    read = {f"marker:{table.marker_names[m]}" for m in np.unique(table.marker)}
+    read = {f"marker:{name}" for name in table.markers_read}
     places = dict.fromkeys(p.where for p in model.parameters if p.where.startswith("marker:"))
     return tuple(place for place in places if place not in read)
 

@@ -504,7 +504,7 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     problem, found, chosen = solution.problem, solution.fit, solution.reduction
     kept, dropped = chosen.kept, chosen.dropped
     none = np.zeros(len(kept))
-    if problem.large or not np.isfinite(covariance).all():
+    if not np.isfinite(covariance).all():
         return none, none
     size = problem.sizes[kept]
     # By distances base, markers and cable may also be where they were said to be.
@@ -515,7 +515,7 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     root = drawing_root(covariance)
     # Of many readings some tell it as well: it is no smaller where there are more of them.
     looked = problem.sample(BENT_SAMPLE)
-    residual, B = found.residual[looked.rows], found.B[looked.rows] * size
+    residual, B = found.residual[looked.rows], looked.regressor(found.x, kept).B * size
     rng, steps = np.random.default_rng(0), np.zeros((BENDS, len(found.x)))
     steps[:, dropped] = delta = typical * rng.standard_normal((BENDS, len(dropped)))
     steps[:, kept] = rng.standard_normal((BENDS, len(kept))) @ root.T - delta @ chosen.mixing.T

@@ -28,7 +28,7 @@ from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometr
 from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import drawn_joints, highest_origins, reach_of, suitable_load
+from elastocal.model.rigid import drawn_joints, origin_heights, reach_of, suitable_load
 from elastocal.model.urdf import TRACKER, Tree, XmlFile, check_urdf, is_called, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
@@ -300,7 +300,7 @@ effects = [
 clearance_mm = {clearance}
 
 [[workspace.keep_out]]
-name = "mounting plane"                # the arm stays above it, z of the base
+name = "mounting plane"                # the arm stays {side} it, z of the base
 point_m = {origin}
 normal = {up}
 
@@ -334,8 +334,10 @@ def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]
     thin = max(5 * round(thick * 0.6 / 5), 5)
     radii = [thick if i < n - 3 else thin for i in range(n)]
     # What never leaves the mounting plane is no body that could strike it.
-    highest = highest_origins(chain) * 1e3
-    radii = [0 if h <= r else r for h, r in zip(highest, radii, strict=True)]
+    heights = origin_heights(chain) * 1e3
+    hangs = heights.max() <= 1 < -heights.min()
+    farthest = (-heights if hangs else heights).max(axis=0)
+    radii = [0 if h <= r else r for h, r in zip(farthest, radii, strict=True)]
     if chain.kinds[:2] == ("prismatic", "prismatic"):  # of a gantry: no column in its middle
         radii[0] = 0
     return {
@@ -350,7 +352,8 @@ def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]
         "whose": whose,
         "radii": f"link_radius_mm = [{', '.join(map(str, radii))}]",
         "clearance": thin,
-        "up": _vector(turned[:, 2]),
+        "up": _vector(-turned[:, 2] if hangs else turned[:, 2]),
+        "side": "below" if hangs else "above",
         "loads": f"loads_N = [[0, 0, 0], [0, 0, -{suitable_load(reach):g}]]",
         "reach": reach,
     }

@@ -110,13 +110,13 @@ def drawn_joints(chain: Chain) -> tuple[Array, Array, Array]:
     return low, high, np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
 
 
-def highest_origins(chain: Chain) -> Array:
-    """The largest height (joints,) in m of each joint's origin above the base, of drawn poses."""
+def origin_heights(chain: Chain) -> Array:
+    """The height (poses, joints) in m of each joint's origin above the base, of drawn poses."""
     symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
     placed = zip([base, *nominal_frames(chain, symbol, base)], chain.joints, strict=False)
     origins = ca.horzcat(*(point(T, joint.placement[:3, 3]) for T, joint in placed))
     heights = BatchFunction([symbol], [origins[2, :]])(drawn_joints(chain)[2])[0]
-    return np.asarray(heights).reshape(-1, chain.n_joints).max(axis=0)
+    return np.asarray(heights).reshape(-1, chain.n_joints)
 
 
 def reach_of(chain: Chain) -> float:

@@ -44,7 +44,7 @@ from elastocal.model.chain import (
 from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.planning.criteria import CRITERIA, criterion_named
+from elastocal.planning.criteria import CRITERIA, criterion_named, root
 from elastocal.planning.feasibility import CandidateCounts, Feasibility
 from elastocal.planning.information import (
     IDENTIFIED,
@@ -55,14 +55,7 @@ from elastocal.planning.information import (
     plan_forces,
     with_noise_of,
 )
-from elastocal.planning.plan import (
-    Chance,
-    Gain,
-    Plan,
-    PlanSize,
-    predicted,
-    reasons,
-)
+from elastocal.planning.plan import Chance, Gain, Plan, PlanSize, predicted, reasons
 from elastocal.planning.poses import (
     Candidates,
     Pins,
@@ -320,9 +313,11 @@ class _Design:
             sight = self.feasibility.seen
             setup = set_up(whole, q, len(q), self.targets[0], known, sight=sight, hold=True)
             M = setup.gathered(setup.information.blocks(q, readings))
-        if done is None or setup.target_rows is None:
+        A, held = setup.inputs.A, setup.held
+        if done is None or A is None or held is None:
             return None
-        return Gain.of(setup.target_rows, setup.prior, M, options.seed)
+        R = root(np.concatenate([A, held], axis=2), setup.inputs.target_weights())
+        return Gain.of(R, setup.prior, M, options.seed)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         shares = shares_of(self.cell, n_poses) - self.pinned

@@ -353,11 +353,9 @@ class Estimable:
         least = OUTSIDE * float(np.abs(A * self.sizes).max(initial=0.0))
         return tuple(int(self.structure.dropped[d]) for d in order if off[d] > least)
 
-    def remaining_bias(self, A: Array, weight: Array) -> float:
-        """Rms in m by which typical deviations of held parameters move the test points, A (T, r,
-        parameters) with `weight` (T,)."""
-        off = self._unexplained(A, self.reduction)
-        return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
+    def held(self, A: Array) -> Array:
+        """(T, r, d) in m, by how much typical deviations of what is held move the test points."""
+        return self._unexplained(A, self.reduction)
 
     def _unexplained(self, A: Array, r: Reduction) -> Array:
         """(T, r, dropped): A_D − A_K · mixing, times the sizes."""

@@ -94,7 +94,8 @@ class Setup:
     of: `inputs` of the test poses alone, and `beyond`, ∂position/∂parameters (T, r, p) at poses all
     over the joint ranges and their weights (T,), on which `share` of the criterion's weight lies.
     `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one.
-    `pinned`: poses that stay, which every problem knows before."""
+    `pinned`: poses that stay, which every problem knows before.  `held` (T, r, d): `Estimable`'s at
+    the test poses."""
 
     information: PoseInformation
     found: Estimable
@@ -105,6 +106,7 @@ class Setup:
     ways: IntArray
     share: float = 0.0
     pinned: FeasiblePool | None = None
+    held: Array | None = None
 
     @cached_property
     def criterion(self) -> ScenarioCriterion:
@@ -215,7 +217,8 @@ def _aimed(
     lost = [model.names[c] for c in found.unpredictable(rows)] if hold else []
     why = [f"so many poses show less of {listed(weak)} than their noise"] * bool(weak)
     why += [f"no poses tell {listed(lost)} from the rest, or show them"] * bool(lost)
-    if why and (bias := found.remaining_bias(rows, weight)) >= WORTH_TELLING:
+    held = found.held(rows)
+    if why and (bias := np.sqrt(weight @ (held**2).sum(axis=(1, 2)))) >= WORTH_TELLING:
         told += (
             f"{'; '.join(why)}; identification holds what it cannot see, and typical deviations "
             f"of that move the test points by {length(bias)} rms, which the criterion "
@@ -233,7 +236,8 @@ def _aimed(
             "over the joint ranges, but the rules allow none, or no plan can make all of them "
             "certain; leave it out"
         )
-    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=setup.warnings + told)
+    told, held = setup.warnings + told, held[:T]
+    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=told, held=held)
 
 
 # The weight of what lies elsewhere, from the price that the test poses may pay for it.

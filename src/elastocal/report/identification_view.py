@@ -204,7 +204,7 @@ def what_was_identified(result: Calibration) -> str:
         text += f"separate ({count[findings.ABSORBED]} held in exchange)"
     told = {
         **NO_VALUE, findings.INVISIBLE: "not visible in these data",
-        findings.UNREAD: "of markers without a reading", findings.FIXED: "fixed by the user",
+        findings.UNREAD: "of markers without own readings", findings.FIXED: "fixed by the user",
     }  # fmt: skip
     for kind, why in told.items():
         if found := count[kind]:
@@ -345,7 +345,7 @@ HELD = {
     findings.ABSORBED: ", absorbed in a combination",
     REDUNDANT: ", not identifiable at any pose under these loads (expected)",
 }
-WITHOUT = {findings.UNREAD: "held: no reading of this marker", findings.FIXED: "fixed by the user"}
+WITHOUT = {findings.UNREAD: "held: no reading of its own", findings.FIXED: "fixed by the user"}
 
 
 def limits(result: Calibration, e: Estimate) -> str:

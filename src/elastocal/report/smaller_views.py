@@ -369,7 +369,7 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
         f"{say.counted(len(table), 'reading')} of {poses}, {span} per configuration, marker and "
         "load",
     )
-    yield "Markers", listed(table.marker_names, 20)
+    yield "Markers", listed(table.markers_read, 20)
     forces, sizes = np.unique(table.force, axis=0, return_counts=True)
     loads = [
         f"{load_text(force)}: {say.counted(int(n), 'reading')}"
