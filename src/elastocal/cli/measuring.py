@@ -261,7 +261,8 @@ def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str
     if (readings := plan.model.cell.design.repeats) > 1:
         carried += f" --repeats {readings}"
     added = "" if augment is None else f" (add them to {augment})"
-    read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
+    places = "x_mm, y_mm, z_mm" + ", rx_deg, ry_deg, rz_deg" * (plan.model.observe == "pose")
+    read = "distance_mm" if plan.model.observe == "distance" else places
     via = f"by the via points of {output.with_suffix('.json')}, " * bool(plan.execution.between)
     text = (
         f"Next: measure {output} in its order, {via}{hung}a row with {read} for each marker{added};"
