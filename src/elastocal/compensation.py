@@ -449,7 +449,7 @@ def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) ->
             f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} to "
             f"line {targets.table.row[i]}, much more than the tool's motion asks for); where the "
             "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
-            "the posture wanted"
+            "one posture throughout"
         )
     change = np.abs(q - c.nominal)[:, c.chain.turning].max(axis=1, initial=0.0)
     large = c.reached & (change > LARGE_CORRECTION)
@@ -472,6 +472,9 @@ def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
             f"{targets.table.source}: no load is stated, so no compliance is compensated; where "
             f"the tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
         )
+    if arm.model.observe == "deflection":
+        told = "the readings are deflections: std_um and within95_um are of what the load moves the"
+        yield f"{told} tool by; where the unloaded arm is, robot file and cell say"
     if told := arm.untried(targets.table.force):
         yield f"{targets.table.source}: {told}"
     where = "[model.compliance_levels], where the compliance of the nearest level is assumed"
@@ -520,10 +523,15 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     surest[far] = _std_of_markers(arm, c, far)
     outside = far & (surest > shown.most)
     outside &= shown.chance(int(outside.sum()), n) < UNLIKELY
+    several = "these targets are" if outside.sum() > 1 else "this target is"
+    there = f"{several} outside the measured poses", "measure poses there"
+    if arm.model.observe == "deflection":
+        more = f"identify without the geometry that they are to tell ({option('fix')})"
+        there = "deflections hardly tell where the tool is", more
     for which, std, told, remedy in (
         (far & ~outside, sure.std, f"where the {c.point.told} lies on the tool is hardly known",
          f"measure a marker there, or choose a marker that was fitted ({option('point')})"),
-        (outside, surest, "outside the measured poses", "measure poses there"),
+        (outside, surest, *there),
     ):  # fmt: skip
         most, at_poses = length(std[which].max(initial=0.0)), length(shown.most)
         sizes = f"(standard deviation {most} at most, at measured poses {at_poses})"

@@ -33,7 +33,6 @@ POSES = 50  # from which sizes are taken
 # m per rad/(N m) or m/N: what moves a reading by less would move it by a mm only at 1000 rad/(N m),
 # and is rounding.  Loads of whole arms have slopes of 0.1 and more.
 SHOWS = 1e-6
-OF_RATED = 10.0  # times the rated torque: no planned load winds a drawn joint up by more
 
 
 def values_from(model: Model, chosen: dict[str, float]) -> Array:
@@ -76,17 +75,9 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
 
 def _usual(model: Model, p: Parameter) -> float:
     """The compliance that arms have where `identify` expects one (`load_ratio`); 0 elsewhere."""
-    i, chain, cell = index(p.where), model.chain, model.cell
-    if chain.kinds[i] != "revolute" or not statics.weight_torque(chain, i) > 0:
-        return 0.0
-    rated = statics.usual_over_stated_mass(chain) * (statics.rated_torque(chain, cell, i) or 0.0)
-    lever = sum(chain.lengths[i:]) + float(np.linalg.norm(cell.tool.load_point))
-    return statics.RATED_WIND_UP / max(rated, _largest_load(cell) * lever / OF_RATED)
-
-
-def _largest_load(cell: Cell) -> float:
-    loads = np.zeros((1, 3)) if cell.design.loads is None else np.asarray(cell.design.loads)
-    return float(np.linalg.norm(loads, axis=1).max())
+    i, chain = index(p.where), model.chain
+    expected = chain.kinds[i] == "revolute" and statics.weight_torque(chain, i) > 0
+    return statics.usual_compliance(chain, model.cell, i) if expected else 0.0
 
 
 def _sizes_shown(model: Model) -> Array:
@@ -98,7 +89,7 @@ def _sizes_shown(model: Model) -> Array:
     cell = model.cell
     own = tuple(choice for choice in cell.model.effects if choice.name in unsized)
     seen = model.specified(replace(cell.model, observe="position", torque="computed", effects=own))
-    load = _largest_load(cell) or suitable_load(reach_of(model.chain))
+    load = statics.largest_load(cell) or suitable_load(reach_of(model.chain))
     poses = random_table(seen, Conditions(), POSES, 0).take(np.repeat(np.arange(POSES), 3))
     poses = replace(poses, force=np.tile(load * np.eye(3), (POSES, 1)))
     rows = expand_plan(poses, tuple(cell.tool.markers))

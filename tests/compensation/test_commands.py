@@ -135,14 +135,11 @@ def test_a_limit_is_kept_and_named():
     wanted = nominal_flanges(chain, POSTURES[:1] + np.array([0, 0, 0.05, 0, 0, 0]))
     targets = targets_at("t", wanted[:, :3, 3], wanted[:, :3, :3], "base", DOWN, q=POSTURES[:1])
     found = commanded(arm, targets, "0,0,0.001")
-    assert found.status == ("limit",)
-    assert found.after[0] > 1e-3
-    assert found.q[0, 2] <= high
+    assert found.status == ("limit",) and found.after[0] > 1e-3 and found.q[0, 2] <= high
     assert np.isnan(found.uncertainty.std[0])
     # With the rotation free, the other joints take over, and a sentence says so.
     free = commanded(arm, replace(targets, rotation=None), "0,0,0.001")
-    assert free.status == ("reached",)
-    assert free.q[0, 2] <= high
+    assert free.status == ("reached",) and free.q[0, 2] <= high
     assert any("joint 3 stands at its limit" in told for told in free.warnings)
 
 
@@ -225,7 +222,7 @@ def test_given_joints_that_jump_are_told() -> None:
     found = commanded(arm, replace(targets, q=q), "0.1,0,0.2")
     assert not commanded(arm, replace(targets, q=q, position=None), "0.1,0,0.2").warnings
     told = [text for text in found.warnings if "solution branch changes" in text]
-    assert len(told) == 1 and told[0].startswith("path, line 21:")
+    assert len(told) == 1 and told[0].startswith("path, line 21:") and "one posture" in told[0]
 
 
 def test_scattered_places_are_reached_in_the_nearest_posture_and_one_out_of_reach_stops_none():
@@ -239,8 +236,7 @@ def test_scattered_places_are_reached_in_the_nearest_posture_and_one_out_of_reac
     position, rotation = circle(30)
     position[10] = [9.0, 0.0, 0.0]
     q, reached = nominal_path(chain, position, rotation, PLACE, limits, HOME)
-    assert np.flatnonzero(~reached).tolist() == [10]
-    assert np.abs(q[11] - q[9]).max() < 0.2
+    assert np.flatnonzero(~reached).tolist() == [10] and np.abs(q[11] - q[9]).max() < 0.2
 
 
 # Correction tables

@@ -54,8 +54,6 @@ TABLE = (
     Mistake("nothing to fit", QUICK, "wished.toml", '["joint_compliance"]', "[]"),
     asked("a combination that no pose shows",
           'criterion = "c"\ncombination = { "joint1.compliance" = 1.0 }'),
-    Mistake("a test pose that hangs on it", QUICK.replace("wished", "planned"),
-            "planned.toml", '["joint_compliance"]', '["joint_compliance", "base_frame"]'),
     Mistake("fewer equations than parameters", "design placed.toml -o p.csv --poses 1 "
             "--candidates 60 --effort quick -q --criterion D"),
     optioned("a picture over a folder", "--picture study"),

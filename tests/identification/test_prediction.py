@@ -41,8 +41,7 @@ def test_regions_hold_the_tool_as_often_as_they_say(fits):
         at = fit.position(q, point=marker)
         tool = CalibratedTool(replace(fit.arm, x=x), tool_point(fit.model.cell, marker))
         held.append(at.holds(tool.poses(tool.rows(fit.model.table(q)), q)[0]).mean())
-        assert (at.half_axes() >= at.half_axes(0.5)).all()
-        assert at.holds(at.position).all()
+        assert (at.half_axes() >= at.half_axes(0.5)).all() and at.holds(at.position).all()
         twice = replace(at, visit=at.covariance)
         np.testing.assert_allclose(twice.half_axes(visit=True), np.sqrt(2) * at.half_axes())
         for size, inside in (
@@ -66,8 +65,17 @@ def test_predicted_error_is_that_at_new_poses(fits):
         inside.append(error <= high)
         assert low < fit.predicted.rms < high
         assert fit.predicted.rms < fit.heldout_rms  # which includes the noise of a reading
-    assert 0.3 < np.mean(ratios) < 1.5
-    assert sum(inside) >= 4
+    assert 0.3 < np.mean(ratios) < 1.5 and sum(inside) >= 4
+
+
+def test_springs_that_no_load_has_shown_count_where_the_arm_works_under_one():
+    model, table, _ = campaign((*GEOMETRY, "joint_compliance"), POSES, 1, tracker=TRACKER)
+    q, weight = random_poses(model.chain, 100, 5), np.full(100, 0.01)
+    for load in 0.0, -100.0:
+        poses = NewPoses(q, np.tile([0.0, 0.0, load], (100, 1)), weight, "here")
+        fit = identify(model, table, new_poses=poses)
+        not_shown = "new_poses_not_shown" in {f.kind for f in fit.findings}
+        assert bool(load) == not_shown == bool(fit.arm.untried(poses.force)) != fit.verdict.trusted
 
 
 @pytest.mark.parametrize("sideways", [0.0, 300.0])

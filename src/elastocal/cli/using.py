@@ -295,10 +295,10 @@ def compensate(
         lambda screen: print_blocks(screen, compensation_blocks(content)),
     )
     if shown and output is not None and reached:
-        say(
-            f"Next: Run {output.name} and measure some. 95 % of the targets should be reached "
-            "within its column within95_um, measurement noise excluded."
-        )
+        told = " 95 % of the targets should be reached within its column within95_um, measurement "
+        told += "noise excluded."
+        kept = told * (arm.model.observe != "deflection")  # of which nothing says where the tool is
+        say(f"Next: Run {output.name} and measure some.{kept}")
 
 
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")

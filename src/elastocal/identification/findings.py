@@ -378,7 +378,9 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
     yield _note("new_poses", rms_um=found.rms, **numbers)
     if found.open**2 > MOSTLY * found.rms**2:
         numbers = {"open_um": found.open, "heldout_rms_um": result.heldout_rms}
-        yield _care("new_poses_not_shown", **numbers, parameters=found.blamed)
+        told = " For a part of the joint ranges alone, state test poses in the cell."
+        remedy = more_poses() + told * (not result.model.cell.design.states_test_poses)
+        yield _care("new_poses_not_shown", remedy, **numbers, parameters=found.blamed)
     if found.rms > result.nominal_rms / LITTLE and not only_placed(result):
         yield _care("new_poses_no_gain", rms_um=found.rms, nominal_rms_um=result.nominal_rms)
 

@@ -34,7 +34,8 @@ from elastocal.measurements import Measurements
 from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVisits, OpenParameters
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
-from elastocal.model.effects.base import Parameter
+from elastocal.model.effects.base import index
+from elastocal.model.effects.statics import JointCompliance, usual_compliance
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, BoolArray, IntArray, microns
@@ -138,7 +139,7 @@ def left_open(
     own = ~(model.shrunk[kept] | np.isin(kept, reduction.with_prior))
     open_ = reduction.dropped[~model.shrunk[reduction.dropped]]
     mixing = np.zeros((len(kept), len(open_)))
-    typical = typical_sizes(model.parameters, x, kept)
+    typical = typical_sizes(model, x, kept)
     typical = np.where(deviates(model), solution.problem.sizes, typical)
     if len(open_) and own.any():
         R = solution.fit.of_free.R * typical[free]
@@ -197,19 +198,25 @@ def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:
     return tuple(place for place in places if place not in read)
 
 
-def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -> Array:
+def typical_sizes(model: Model, x: Array, kept: IntArray) -> Array:
     """Typical deviation (parameters,) of each parameter; where none is known beforehand, the root
-    mean square of what was determined of its kind (of all joints' compliances)."""
+    mean square of what was determined of its kind (all joints' compliances), else the usual one."""
     found: dict[tuple[str, str], list[float]] = {}
     for k in kept:
-        p = parameters[k]
+        p = model.parameters[k]
         found.setdefault((p.effect, p.unit), []).append(float(x[k]))
     rms = {kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in found.items()}
-    own = np.isin(np.arange(len(parameters)), kept).astype(float)
-    each = zip(parameters, own.tolist(), strict=True)
-    return np.array(
-        [p.typical or abs(p.nominal) or rms.get((p.effect, p.unit)) or k for p, k in each]
-    )
+    usual = {
+        p.name: usual_compliance(model.chain, model.cell, i)
+        for p in model.parameters
+        if p.effect == JointCompliance.name and model.chain.kinds[i := index(p.where)] == "revolute"
+    }
+    own = np.isin(np.arange(len(model.parameters)), kept).astype(float)
+    each = zip(model.parameters, own.tolist(), strict=True)
+    return np.array([
+        p.typical or abs(p.nominal) or rms.get((p.effect, p.unit)) or usual.get(p.name) or k
+        for p, k in each
+    ])  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -238,8 +238,6 @@ def remedies() -> dict[str, str]:
         "knowledge_contradicted": "Check names, units and signs of what is stated, and whether the "
         "model lacks an effect.",
         "many_faulty_readings": "Check where they lie before excluding any.",
-        "new_poses_not_shown": f"{more_poses()} For a part of the joint ranges alone, state test "
-        "poses in the cell.",
         "not_converged": "Give start hints in [model.nominal], fit fewer effects, or measure more "
         "poses.",
         "residual_below_stated_noise": "State the tracker's true noise: with noise stated too "
@@ -572,10 +570,10 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """Rms in m to which the load point is known at new poses, where that is more than the
         verdict says of the markers: nothing measured tells where it lies among them.
 
-        It is the default point of `compensate`.  None where it is known as well, or not stated.
+        It is the default point of `compensate`.  None where known as well, unstated, or deflected.
         """
         tool, at = self.model.cell.tool, self.verdict.at
-        if not tool.load_point.any() or at is None:
+        if not tool.load_point.any() or at is None or self.model.observe == "deflection":
             return None
         poses = prediction.over_the_workspace(self.model.cell, self.model, self.observations.table)
         try:

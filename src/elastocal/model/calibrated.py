@@ -202,11 +202,11 @@ class CalibratedArm(Valued, Saved):
         return self.covariance, np.array([dof.get(name, np.inf) for name in self.determined])
 
     def untried(self, force: Array) -> str:
-        """In words, where some of the loads (N, 3) are heavier than any measured."""
+        """In words, where some of the loads (N, 3) are heavier than any measured (kept rounded)."""
         most, asked = (np.linalg.norm(f, axis=1).max(initial=0.0) for f in (self.loads, force))
         told = f"a load of {asked:.4g} N, where {most:.4g} N at most were measured: the springs are"
         told += " taken to yield alike beyond; measure under such a load"
-        return told if self.elastic and 0 < most * 1.001 < asked else ""  # loads are rounded
+        return told if self.elastic and len(self.loads) and most * 1.001 < asked else ""
 
     @checked_arguments
     def pose(self, q: ArrayLike, load: ArrayLike | None = None) -> NDArray:

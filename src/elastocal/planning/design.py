@@ -60,6 +60,7 @@ from elastocal.planning.poses import (
     Candidates,
     Pins,
     TargetPoses,
+    at_work,
     brought,
     check_available,
     draw,
@@ -344,13 +345,11 @@ class _Design:
         if self.first is not None:
             return self.first.targets
         cell, seed = self.cell, self.options.seed
-        # There the arm works, and the tracker need not see it.
-        workspace = replace(cell.workspace, visibility=None, load=None)
-        at_work = Feasibility(replace(cell, workspace=workspace), self.chain)
-        targets = test_poses(cell, self.chain, at_work, seed)
+        rules = at_work(cell, self.chain)
+        targets = test_poses(cell, self.chain, rules, seed)
         if "test_poses" not in CRITERIA[cell.design.criterion].needs:
             return targets, None
-        return targets, everywhere(cell, self.chain, at_work, seed)
+        return targets, everywhere(cell, self.chain, rules, seed)
 
     def _candidates(self) -> tuple[Array, IntArray, CandidateCounts]:
         state = self.checkpoint.finished("candidates", self._drawn)

@@ -478,9 +478,17 @@ def test_poses(
     )
 
 
+def at_work(cell: Cell, chain: Chain) -> Feasibility:
+    """The rules where the arm works: the tracker need not see it there."""
+    workspace = replace(cell.workspace, visibility=None, load=None)
+    return Feasibility(replace(cell, workspace=workspace), chain)
+
+
 def used_poses(cell: Cell, chain: Chain) -> TargetPoses | None:
-    """Where the cell says that the arm will be used: its test poses; None where it states none."""
-    return test_poses(cell, chain) if cell.design.states_test_poses else None
+    """The test poses of the cell's plans, where the arm will be used; None where it has none."""
+    places = cell.design.test_path is not None or cell.design.test_box is not None
+    rules = at_work(cell, chain) if places else None  # of joints that are stated none is asked
+    return test_poses(cell, chain, rules) if cell.design.states_test_poses else None
 
 
 def everywhere(
@@ -676,8 +684,13 @@ def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool 
     lengths move readings in the same way.  Where the markers' own places are fitted and no point
     was stated, it is that of the M markers, each divided by √M, as only they can be known.  A
     stated point may be `carried` by the markers, as a body that they are fixed to, instead of the
-    flange.
+    flange.  Deflections are calibrated for: there it is what the load moves the point by.
     """
+    if model.observe == "deflection":
+        placed = model.specified(replace(model.cell.model, observe="position"))
+        unloaded = replace(targets, force=np.zeros_like(targets.force))
+        A = prediction_rows(placed, targets, x, carried)
+        return A - prediction_rows(placed, unloaded, x, carried)
     by_marker = ~targets.stated & fitted_markers(model)
     bodies = targets.stated & carried
     lone = ~by_marker & ~bodies

@@ -549,6 +549,23 @@ def usual_over_stated_mass(chain: Chain) -> float:
     return 1.0 if alike or mass == 0 or gantry else usual / mass
 
 
+OF_RATED = 10.0  # times the rated torque: no planned load winds a joint up by more
+
+
+def largest_load(cell: Cell) -> float:
+    loads = np.zeros((1, 3)) if cell.design.loads is None else np.asarray(cell.design.loads)
+    return float(np.linalg.norm(loads, axis=1).max())
+
+
+def usual_compliance(chain: Chain, cell: Cell, i: int) -> float:
+    """rad/(N m) that wind revolute joint i (0-based) up by RATED_WIND_UP at its rated torque by the
+    links' weights, else that of the largest load planned."""
+    rated = usual_over_stated_mass(chain) * (rated_torque(chain, cell, i) or 0.0)
+    lever = sum(chain.lengths[i:]) + float(np.linalg.norm(cell.tool.load_point))
+    planned = largest_load(cell) * lever
+    return RATED_WIND_UP / max(rated or planned or UNRATED, planned / OF_RATED)
+
+
 def torque_scale(chain: Chain, cell: Cell, i: int) -> float:
     """τ_s in N m, a thousandth of the rated torque: torques below it are so small that friction and
     play blur their sign.  A true dead zone turns over at once, and a wrist seldom sees more than a
