@@ -479,7 +479,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
         """
-        import_module(VIEWS).write_page(self, Path(path), inputs, command, seed, certificate=True)
+        import_module(VIEWS).write_page(self, path, inputs, command, seed, certificate=True)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -637,6 +637,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         without a reading that was fitted is of another session, as the `test` of `identify`."""
         table = self.model.read(q) if hasattr(q, "to_csv") else q
         if isinstance(table, Measurements):
+            require(load is None, f"{option('load')} goes with joints; a table states its own")
             table = self.as_visited(table)
             observed = observe(table, self.model.observe)
             return self.model.predict(table, self.x, observed).reshape(-1, observed.size)
