@@ -62,6 +62,7 @@ CALLS: dict[str, Any] = {
     "pose": (["q", "x", "load"], lambda m, d, f, **k: m.pose(**{"q": d.q[0]} | k)),
     "Model": (["backend"], lambda m, d, f, **k: ec.Model(m.cell, **k)),
     "uncertainty": (["table"], lambda m, d, f, **k: f.uncertainty(**k)),
+    "unmet": (["heldout"], lambda m, d, f, **k: f.unmet(**k)),
     "plot": (["kind"], lambda m, d, f, **k: f.plot(**k)),
     "predict": (["table", "x"], lambda m, d, f, **k: m.predict(**{"table": d} | k)),
     "B": (["table", "x"], lambda m, d, f, **k: m.B(**{"table": d} | k)),
@@ -96,8 +97,9 @@ CALLS: dict[str, Any] = {
 }  # fmt: skip
 # These mean something: none by name, a factor or a seed that is any number.
 MEANT = {
-    ("simulate", "values", "{}"), ("simulate", "draw", str(10**12)),
+    ("simulate", "values", "{}"),
     *((verb, "seed", str(10**12)) for verb in ("simulate", "compare", "identify")),
+    *((verb, name, str(10**12)) for verb, name in (("simulate", "draw"), ("unmet", "heldout"))),
     *(("identify", name, none) for name in ("fixed", "prior") for none in ("[]", "{}")),
 }  # fmt: skip
 

@@ -320,9 +320,8 @@ def test_what_a_user_guesses(folder):
     assert again.params == fit.params == dict(zip(model.names, fit.x, strict=True))
     assert np.array_equal(again.model.B(model.read(frame), fit.x), fit.B)
     assert fit == again and len({fit, again}) == 1
-    assert (
-        fit.residuals.shape == (270, 3) and fit.to_dict()["schema"] == "elastocal/identification/1"
-    )
+    assert fit.residuals.shape == (270, 3)
+    assert fit.to_dict()["schema"] == "elastocal/identification/1"
     assert fit.summary() == str(fit)
     plan = model.read_plan(folder / "plan.csv")
     assert ec.simulate(model, plan.to_dataframe()) == ec.simulate(model, plan)
@@ -334,9 +333,11 @@ def test_what_a_user_guesses(folder):
     told = "joint3.compliance = (4.167 ± 0.014)e-07 rad/(N*m) (standard deviation)"
     assert str(fit["joint3.compliance"]) == told
     assert str(fit["joint1.compliance"]) == "joint1.compliance: no value"
-    for wrong in (ec.read_cell, ec.init, fit.save, fit.report):
+    for wrong in (ec.read_cell, ec.init, fit.save, fit.report, fit.certificate):
         with pytest.raises(ec.InputError, match="path"):
             wrong(5)
+    with pytest.raises(ec.InputError, match="`load` goes with joints"):
+        fit.predict(table, load=[0, 0, -1])
     with pytest.raises(ec.InputError, match="DataFrame"):
         model.read(frame.drop(columns=[c for c in frame if c.startswith("q1_")]))
 

@@ -1,13 +1,9 @@
 """What the functions and results of the front door have in common.
 
-Functions have their arguments checked by their annotations:
-
-    @checked_arguments
-    def compare(old: CalibratedArm, *, level: float = 0.05, poses: int = 300, seed: int = 0): ...
-
-An annotation names kinds, `A | B`: of each that is known here it is checked whether a value is one,
-and a value that is none is an InputError that names the argument.  What a value means (a marker
-that is there, a share below 1) is for the function itself.
+Functions have their arguments checked by their annotations, which name kinds, `A | B`: of each
+that is known here it is checked whether a value is one, and a value that is none is an InputError
+that names the argument.  What a value means (a marker that is there, a share below 1) is for the
+function itself.
 
 Results are shown by `elastocal.report` and written by `elastocal.saving`, which lie above the
 packages whose results they serve, and import them.  A result therefore asks for its views and
@@ -313,7 +309,7 @@ SAME = {"force": "load", "load": "force"}
 BY_NAME: dict[str, list[tuple[str, Check]]] = {
     "seed": [(f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator",
               lambda v: (_whole(v) and 0 <= v <= LARGEST_SEED) or _is_a("Generator")(v))],
-    "load": [("finite numbers", lambda v: v is None or _values(v, "iuf"))],
+    "load": [("finite numbers", lambda v: _values(v, "iuf"))],
 }  # fmt: skip
 
 
@@ -328,7 +324,8 @@ def checked_arguments(function: F) -> F:
         for name, given in signature.parameters.items()
         if isinstance(given.annotation, str)
     }
-    kinds |= {name: BY_NAME[name] for name in kinds if name in BY_NAME}
+    none = KINDS["None"]
+    kinds |= {n: BY_NAME[n] + [none] * (none in kinds[n]) for n in kinds if n in BY_NAME}
     renamed = {o: n for o, n in SAME.items() if n in kinds and o not in kinds}
 
     @functools.wraps(function)
@@ -374,10 +371,12 @@ def sealed(result: Any) -> Any:
 
 
 def kinds_of(annotation: str) -> list[str]:
-    """The members of a union, aliases resolved; a Literal is a text, which the function checks."""
+    """The members of a union, aliases resolved; a Literal is a text, which the function checks, and
+    a Callable whatever can be called."""
     found: list[str] = []
     for part in re.split(r" \| (?![^\[]*\])", annotation.strip("\"'")):
         part = "str" if part.startswith("Literal[") else part
+        part = "Progress" if part.startswith("Callable[") else part
         found += kinds_of(ALIASES[part]) if part in ALIASES else [part]
     return found
 

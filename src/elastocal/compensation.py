@@ -27,8 +27,6 @@ from elastocal.model.rigid import BoundedSearch, Postures, Reaching, inverse_kin
 from elastocal.tables import column, csv_text
 from elastocal.units import Array, BoolArray, IntArray, pose_at
 
-NEITHER = 1e-12  # the side that a joint came from where no move of it is known; 0 is a first visit
-
 Frame = Literal["base", "tracker"]
 FRAMES: tuple[Frame, ...] = ("base", "tracker")
 
@@ -55,12 +53,7 @@ class Targets:
         """The table with its forces (n, 3) N and the arm's last move to each row at q (n, joints).
         Joints of which no move is known came from neither side."""
         table = replace(self.table, force=force)
-        if self.path:
-            table = with_moves(replace(table, q=q))
-            assert table.direction is not None
-            side = np.where(table.direction == 0, NEITHER, table.direction)
-            table = replace(table, direction=side)
-        return table
+        return with_moves(replace(table, q=q)).from_neither_side() if self.path else table
 
 
 def read_targets(

@@ -198,6 +198,12 @@ class Measurements(Result):
         held: dict[str, Any] = {k: v for k, v in vars(self).items() if isinstance(v, np.ndarray)}
         return replace(self, **{name: values[index] for name, values in held.items()})
 
+    def from_neither_side(self) -> Measurements:
+        """The table of a session that is not the one fitted: how the arm came to the first visit of
+        that, where `direction` is 0, is of no other one."""
+        side = self.direction
+        return self if side is None else replace(self, direction=np.where(side == 0, 1e-12, side))
+
     __getitem__ = take  # data[data.marker == 0], data[:90]
     __iter__ = None  # rows have no form of their own
 

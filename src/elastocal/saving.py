@@ -203,10 +203,8 @@ def load(path: str | Path, cell: str | Path | None = None) -> Model | Calibrated
     told = "give a cell file (.toml), a result of identify (.json) or a table (.csv, .parquet)"
     require(kind in (".json", ".csv", *PARQUET), f"{path}: {told}")
     of = path.parent / "cell.toml" if cell is None else Path(cell)
-    require(
-        cell is not None or of.is_file(),
-        f"there is no cell.toml beside {path}; name the cell file by {option('cell')}",
-    )
+    told = f"there is no cell.toml beside {path}; name the cell file by {option('cell')}"
+    require(cell is not None or of.is_file(), told)
     return read_calibrated(of, path) if kind == ".json" else Model(of).read(path)
 
 

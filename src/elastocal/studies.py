@@ -1,9 +1,5 @@
 """Studies: many independent tasks, each result of which is kept as it comes.
 
-    study = read_study("experiment_design/coverage", options=["replicates=200"])
-    run_study(study, "look", jobs=4)
-    frame = read_results("look")
-
 A study's folder holds `study.py` (what to compute) and `study.toml` (seed, options, columns).  What
 a worker needs of it travels as `Sources`; their hash, the seed and the task's values say whether a
 result on disk is of this very task.  Only the process that the user started writes, a line of JSON
@@ -31,7 +27,7 @@ import time
 import tomllib
 import traceback
 from collections import Counter, deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from contextlib import closing, contextmanager, suppress
 from copy import deepcopy
@@ -47,6 +43,7 @@ import numpy as np
 from pydantic import Field
 
 from elastocal import __version__, messages
+from elastocal.above import checked_arguments, whole
 from elastocal.config import Table, checked, read_toml
 from elastocal.files import atomic_write, read_bytes, read_json, read_text
 from elastocal.messages import ElastocalError, InputError, listed, option, quoted, require
@@ -112,23 +109,24 @@ class Study:
     tasks: tuple[Row, ...]
 
 
-def read_study(folder: str | Path, seed: int | None = None, options: Iterable[str] = ()) -> Study:
+@checked_arguments
+def read_study(folder: str | Path, seed: int | None = None, options: Sequence[str] = ()) -> Study:
     """The study in `folder`, with another seed, and options as KEY=VALUE, where given."""
     folder = Path(folder)
     require(folder.is_dir(), f"{folder}: no such folder; name the folder of a study")
     for name, what in (("study.py", "tasks() and run()"), ("study.toml", "seed and columns")):
         told = f"{folder}: holds no {name}; a study has one, with its {what}"
         require((folder / name).is_file(), told)
-    path, whole = folder / "study.toml", folder.resolve()
+    path, home = folder / "study.toml", folder.resolve()
     stated = checked(StudyFile, read_toml(path, "study file"), path)
     for name in stated.columns:
         require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
-    settled: dict[str, Any] = {"title": stated.title or whole.name, "options": chosen}
+    settled: dict[str, Any] = {"title": stated.title or home.name, "options": chosen}
     settled |= {} if seed is None else {"seed": seed}
-    sources = Sources(whole, _contents(whole, stated, path), stated.model_copy(update=settled))
+    sources = Sources(home, _contents(home, stated, path), stated.model_copy(update=settled))
     return Study(folder, sources, tuple(_tasks(folder, load(sources), sources)))
 
 
@@ -145,7 +143,7 @@ def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
     return {name: read_bytes(folder / name, "file of a study", MOST_OF_A_FILE) for name in parts}
 
 
-def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
+def _with_options(path: Path, defaults: Mapping[str, Any], given: Sequence[str]) -> dict[str, Any]:
     options = dict(defaults)
     for text in given:
         key, equals, written = (part.strip() for part in text.partition("="))
@@ -171,7 +169,9 @@ def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
         told = f"defines no function {name}(); a study has tasks(options) and run(task, rng)"
         require(callable(getattr(module, name, None)), f"{script}: {told}")
     given = dict(stated.options)
-    found = calling(folder, "tasks()", lambda: list(islice(module.tasks(given), MAX_TASKS + 1)))
+    # Each as it comes: a dict may be yielded again and again, with other values.
+    each = partial(map, deepcopy)
+    found = calling(folder, "tasks()", lambda: [*islice(each(module.tasks(given)), MAX_TASKS + 1)])
     require(found, f"{script}: tasks() gives no task with these options; nothing to do")
     told = f"tasks() gives more than {MAX_TASKS} tasks with these options; let each do more"
     require(len(found) <= MAX_TASKS, f"{script}: {told}")
@@ -182,7 +182,7 @@ def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
         for key in task:
             told = f"{where}: {quoted(key)} cannot be a key; keys are text, and {TAKEN}"
             require(isinstance(key, str) and key not in RESERVED, told)
-            told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
+            told = f"{folder}/study.toml: columns.{key} is also a value of the tasks; rename one"
             require(key not in stated.columns, told)
         values = json.loads(_json(where, dict(task)))
         told = _task_hash(sources.digest, stated.seed, index, values)
@@ -380,6 +380,7 @@ def statement_of(folder: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+@checked_arguments
 def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     """The rows of a study, sorted by task and row; failed tasks only where `failed`.  Columns:
     task, task_hash, the task's values, task_row, the results, task_seconds, elastocal (version),
@@ -419,7 +420,7 @@ def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int 
     """By default one per core; where one alone is asked for it is this process, for a debugger."""
     from joblib.externals import loky
 
-    jobs = jobs or loky.cpu_count()
+    jobs = loky.cpu_count() if jobs in (None, -1) else jobs
     if jobs == 1:
         yield from (execute(study.sources, task) for task in tasks if not stop.asked)
         return
@@ -558,20 +559,25 @@ class Ending:
         return self.done + self.failed == self.total
 
 
+@checked_arguments
 def run_study(
     study: Study, output: str | Path, *, jobs: int | None = None, cluster: str | None = None,
     only: int | None = None, restart: bool = False, retry_failed: bool = False,
     stop: StudyStop | None = None, progress: Callable[[int, int, int], None] = lambda *told: None,
-    tell: Callable[[str], None] = print, **way: Any,
+    tell: Callable[[str], None] = print, tls_ca: Path | None = None, tls_cert: Path | None = None,
+    tls_key: Path | None = None, unencrypted: bool = False,
 ) -> Ending:  # fmt: skip
     """Run the tasks that have no result yet (of the first `only`) and record what comes.  They run
-    in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`, reached
-    this `way` (tls_ca, tls_cert, tls_key, unencrypted).  `restart` discards the results in the
-    folder `output`, `retry_failed` those that are errors, also where study.py was corrected since;
-    `progress` takes the number of tasks, of those that ended and of those that failed.  Raises
-    InputError where the results are of another study, or the cluster cannot be reached;
-    ClusterLostError where the scheduler goes away."""
+    in `jobs` processes (by default, and for -1, one per core), or on the Dask scheduler at
+    `cluster`.  `restart` discards the results in the folder `output`, `retry_failed` those that are
+    errors, also where study.py was corrected since; `progress` takes the number of tasks, of those
+    that ended and of those that failed.  Raises InputError where the results are of another study,
+    or the cluster cannot be reached; ClusterLostError where the scheduler goes away."""
     folder, stop = Path(output), stop or StudyStop()
+    way = {"tls_ca": tls_ca, "tls_cert": tls_cert, "tls_key": tls_key, "unencrypted": unencrypted}
+    for name, count in (("jobs", None if jobs == -1 else jobs), ("only", only)):
+        if count is not None:
+            whole(name, count)
     with opened(folder):
         known, earlier = ([], []) if restart else _known(study, folder, retry_failed)
         kept = [line for line in known if not (retry_failed and line["task_error"])]

@@ -102,9 +102,8 @@ def begin(folder, marks, number, *words):
 
 def local_cluster():
     distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    return distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-    )
+    how = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0"}
+    return distributed.LocalCluster(n_workers=2, **how)
 
 
 @posix

@@ -55,9 +55,8 @@ def test_without_a_name_a_base_tilts_as_its_springs_do() -> None:
     table = rows(np.linspace(-2, 2, 5), force=(30.0, -20.0, -400.0))
     known, nameless = model(stick("z"), "base_compliance"), model(stick("z"), "load_response:base")
     tilted = positions(known, table, tilt_compliance_x=1e-6, tilt_compliance_y=2e-6)
-    np.testing.assert_allclose(
-        positions(nameless, table, load_response_rx=1e-3, load_response_ry=2e-3), tilted
-    )
+    unnamed = positions(nameless, table, load_response_rx=1e-3, load_response_ry=2e-3)
+    np.testing.assert_allclose(unnamed, tilted)
     assert np.ptp(tilted[:, 2]) > 1e-4
 
 

@@ -165,7 +165,7 @@ def test_writing_is_whole_or_not_at_all_and_names_what_was_read(
                                 ("none/r.html", [], "does not exist")):  # fmt: skip
         with pytest.raises(InputError, match=told):
             write_page(case.result, tmp_path / place, inputs=[tmp_path / name for name in inputs])
-    write_page(case.result, tmp_path / "r.html", inputs=[data])
+    write_page(case.result, tmp_path / "r.html", inputs=str(data))
     text = (tmp_path / "r.html").read_text(encoding="utf-8")
     assert hashlib.sha256(data.read_bytes()).hexdigest() in text
 

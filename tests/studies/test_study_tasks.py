@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from support.study_folders import SCRIPT, TOML, numbers, on_processes, run_study, write_study
@@ -22,8 +23,8 @@ from pathlib import Path
 HERE = Path("{marks}")
 
 
-def tasks(options):
-    return [{{"k": k}} for k in range(8)]
+def tasks(options, task={{}}):  # the same one again and again
+    return (task.update(k=k) or task for k in range(8))
 
 
 def run(task, rng):
@@ -63,6 +64,9 @@ def test_one_that_raises_is_recorded_with_its_traceback_until_it_is_retried(tmp_
     assert (retried.before, retried.done, retried.failed) == (10, 12, 0)
     assert run_study(folder, results).before == 12
     assert not failures(results) and len(numbers(results)) == 24
+    for wrong in ({"jobs": 0}, {"only": -1}, {"seed": -1}, {"progress": 3}):
+        with pytest.raises(InputError, match=rf"^`{next(iter(wrong))}` takes"):
+            run_study(folder, results, **wrong)
 
 
 @pytest.mark.parametrize(
@@ -86,7 +90,7 @@ def test_one_that_kills_its_process_is_tried_three_times(tmp_path):
     marks = tmp_path / "marks"
     marks.mkdir()
     folder = write_study(tmp_path / "study", LETHAL.format(marks=marks))
-    ending = run_study(folder, tmp_path / "r", lambda study: on_processes(study, 2))
+    ending = run_study(folder, tmp_path / "r", partial(on_processes, workers=2))
     assert (ending.done, ending.failed) == (7, 1)
     assert sorted(read_results(tmp_path / "r")["task"]) == [0, 1, 2, 4, 5, 6, 7]
     assert len(list(marks.glob("3_*"))) == 3
@@ -177,9 +181,8 @@ def run(task, rng):
 def test_a_task_that_does_not_end_when_it_is_told_to_is_dropped(tmp_path):
     folder, told = write_study(tmp_path / "study", SIGNALLED), []
     with StudyStop(0.1, told.append) as stop:
-        ending = run_study(
-            folder, tmp_path / "r", lambda study: on_processes(study, 1, stop), stop=stop
-        )
+        alone = partial(on_processes, workers=1, stop=stop)
+        ending = run_study(folder, tmp_path / "r", alone, stop=stop)
     assert len(told) == 1 and told[0].startswith("stopping: the running tasks have")
     assert ending.stopped and not ending.complete
     assert list(read_results(tmp_path / "r")["task"]) == [0, 1]

@@ -58,9 +58,7 @@ def on_processes(study: Study, workers: int, stop: StudyStop | None = None):
     return lambda tasks: processes(study, tasks, stop or StudyStop(), workers)
 
 
-def run_study(
-    folder: Path, results: Path, runner=None, seed: int | None = None, **how: Any
-) -> Ending:
+def run_study(folder: Path, results: Path, runner=None, seed: Any = None, **how: Any) -> Ending:
     """The study in `folder` run into `results` by `runner(study)`, by default in this process."""
     study = read_study(folder, seed)
     made = (runner or here)(study)

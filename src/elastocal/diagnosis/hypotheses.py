@@ -44,7 +44,7 @@ from elastocal.model.effects.geometry import (
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import ONCE, BatchFunction
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, no_number
 from elastocal.model.observations import observe
 from elastocal.units import Array, BoolArray
 
@@ -605,6 +605,7 @@ class RegressorDirection:
 
     def __init__(self, hypothesis: Hypothesis, arm: Arm) -> None:
         effect, where = hypothesis.effect, hypothesis.where
+        self._name = f"{effect.name} at {where}"
         assert isinstance(effect, DrivenEffect)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
@@ -630,4 +631,7 @@ class RegressorDirection:
         """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
         G, n = len(settings), len(table)
         D = self._compiled(np.repeat(self.asked(table), G, axis=0), np.tile(settings, (n, 1)))[0]
+        if not np.isfinite(D.sum()):
+            row = np.isfinite(D.reshape(n, -1)).all(axis=1).argmin()
+            no_number(table, int(row), self._name)
         return np.asarray(D.reshape(n, G, *D.shape[1:]))

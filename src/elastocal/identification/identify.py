@@ -39,6 +39,7 @@ from elastocal.identification.noise_summary import noise_of, summarise_residuals
 from elastocal.identification.outliers import describe, drops, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
+    fitted_too,
     left_open,
     over_the_workspace,
     predicted_error,
@@ -73,13 +74,7 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
-from elastocal.measurements import (
-    NEVER_YET,
-    Measurements,
-    numbered,
-    order_contradicted,
-    past_midnight,
-)
+from elastocal.measurements import Measurements, numbered, order_contradicted, past_midnight
 from elastocal.messages import ElastocalError, InputError, listed, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.base import Parameter
@@ -135,18 +130,11 @@ def _doubts(
 ) -> Iterator[str]:
     """Moves out of order where an effect follows the last one, an arm that lies, a test of what was
     fitted."""
-    if test is not None:
-        read = [np.asarray(t.distance if t.position is None else t.position) for t in (table, test)]
-        fitted, kept = (
-            list(map(bytes, np.column_stack([t.q, t.force, values])))
-            for t, values in zip((table, test), read, strict=True)
+    if test is not None and (twice := fitted_too(test, table)):
+        yield (
+            f"{twice} of {len(test)} readings of {test.source} ({option('test')}) are fitted too, "
+            "so that their error tests nothing; give readings of other poses"
         )
-        there = set(fitted)
-        if twice := sum(row in there for row in kept):
-            yield (
-                f"{twice} of {len(test)} readings of {test.source} ({option('test')}) are fitted "
-                "too, so that their error tests nothing; give readings of other poses"
-            )
     moves = any(effect_of(p.effect).family == "move" for p in model.parameters)
     if moves or model.cell.model.approach == BY_ORDER:
         for text in (order_contradicted(one) for one in (table, test) if one is not None):
@@ -219,10 +207,7 @@ def _of_readings(covariance: Array | None, good: BoolArray, size: int) -> Array 
 
 
 def _test_errors(model: Model, result: Calibration, table: Measurements) -> TestErrors:
-    # What came before its first visit is not what came before that of the campaign.
-    table = replace(table, move=None, direction=None)
-    if table.time is None and model.cell.model.clock == "rows":  # after the campaign
-        table = replace(table, time=np.full(len(table), NEVER_YET))
+    table = result.as_visited(table)
     observed = observe(table, model.observe)
     error = observed.value - model.predict(table, result.x, observed)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)

@@ -325,6 +325,16 @@ def _loads(force: Array, observe: str) -> Array:
     return forces if len(forces) else np.zeros((1, 3))
 
 
+def fitted_too(table: Measurements, fitted: Measurements) -> int:
+    """How many readings of the table are among those fitted."""
+    told = [
+        list(map(bytes, np.column_stack([t.q, t.force, values])))
+        for t in (table, fitted)
+        if (values := t.distance if t.position is None else t.position) is not None
+    ]
+    return sum(map(set(told[1]).__contains__, told[0])) if len(told) == 2 else 0
+
+
 def measured_loads(observed: Observations) -> Array:
     """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
     return _evenly(_loads(observed.table.force, observed.kind), MOST_LOADS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import VIEWS, WORDS, DataFrame, Result, checked_arguments
+from elastocal.above import KINDS, VIEWS, WORDS, DataFrame, Result, checked_arguments
 from elastocal.cell_tables import Unsteadiness
 from elastocal.identification import prediction, scrutiny
 from elastocal.identification.faulty_readings import OutlierReport
@@ -22,7 +22,7 @@ from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import Outlier
-from elastocal.measurements import Measurements
+from elastocal.measurements import NEVER_YET, Measurements
 from elastocal.messages import (
     EXACT,
     ElastocalError,
@@ -30,6 +30,7 @@ from elastocal.messages import (
     length,
     option,
     plain,
+    require,
     rounded,
 )
 from elastocal.model import calibrated
@@ -425,6 +426,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
 
         Raises:
             UnknownNameError: A limit of another name.
+            InputError: It is no positive number.
 
         Examples:
             >>> fit = ec.identify("cell.toml", "data.csv")
@@ -442,6 +444,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         for name, most in (vars(self.model.cell.require) | limits).items():
             if name not in found:
                 raise UnknownNameError.of("limit", name, found)
+            good = most is None or (KINDS["float"][1](most) and most > 0)
+            require(good, f"{option(name)} takes a positive number in m or None; found {most!r}")
             if most is not None and not found[name] <= most:
                 value = length(found[name]) if math.isfinite(found[name]) else "not known"
                 if name == "test" and self.test is None:
@@ -473,7 +477,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
         """
-        import_module(VIEWS).write_page(self, Path(path), inputs, command, seed, certificate=True)
+        import_module(VIEWS).write_page(self, path, inputs, command, seed, certificate=True)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
@@ -546,6 +550,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""
+        table = None if table is None else self.as_visited(table)
         return scrutiny.uncertainty_budget(self, self.arm, table) if self._looks else None
 
     @cached_property
@@ -618,19 +623,33 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         model = self.model
         given_force(load, len(model.table(q)))
         tool = calibrated.CalibratedTool(self.arm, calibrated.tool_point(model.cell, point))
-        return prediction.position_at(tool, model.table(q, load), self.noise, self.spread)
+        table = model.table(q, load).from_neither_side()
+        return prediction.position_at(tool, table, self.noise, self.spread)
 
     @checked_arguments
     def predict(
         self, q: ArrayLike | Measurements | DataFrame, load: ArrayLike | None = None
     ) -> Array:
         """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty; of a
-        table (measurements or a data frame) what its readings should be, (n, components)."""
+        table (measurements or a data frame) what its readings should be, (n, components).  A table
+        without a reading that was fitted is of another session, as the `test` of `identify`."""
         table = self.model.read(q) if hasattr(q, "to_csv") else q
         if isinstance(table, Measurements):
+            require(load is None, f"{option('load')} goes with joints; a table states its own")
+            table = self.as_visited(table)
             observed = observe(table, self.model.observe)
             return self.model.predict(table, self.x, observed).reshape(-1, observed.size)
         return self.position(table, load).position
+
+    def as_visited(self, table: Measurements) -> Measurements:
+        """The table; without a reading that was fitted it is of another session: nobody knows how
+        the arm came to it, and where jumps are told by lines it comes after all that were."""
+        fitted = self.observations.table
+        if prediction.fitted_too(table, fitted):
+            return table
+        if self.model.cell.model.clock == "rows" and fitted.time is None:
+            table = replace(table, time=np.full(len(table), NEVER_YET))
+        return table.from_neither_side()
 
     @property
     def params(self) -> dict[str, float]:

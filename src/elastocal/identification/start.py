@@ -25,6 +25,7 @@ from elastocal.messages import (
     listed,
     option,
     quoted,
+    require,
     rounded,
 )
 from elastocal.model.chain import beyond_limits
@@ -561,11 +562,8 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
             )
         held |= set(match)
     free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)
-    if not len(free):
-        raise InputError(
-            f"{model.cell.source}: nothing is left to identify; choose "
-            f"effects with parameters in [model] effects, or hold fewer by {option('fixed')}"
-        )
+    told = "nothing is left to identify; choose effects with parameters in [model] effects, or hold"
+    require(len(free), f"{model.cell.source}: {told} fewer by {option('fixed')}")
     return free
 
 
@@ -573,11 +571,8 @@ def ordinary(model: Model, free: IntArray) -> IntArray:
     """Those of the parameters `free` that no smooth function consists of; InputError where none
     are."""
     found = free[~model.shrunk[free]]
-    if not len(found):
-        raise InputError(
-            "nothing but smooth functions is left to identify; add base_frame and "
-            "marker_position to [model] effects, or free some parameters"
-        )
+    told = "nothing but smooth functions is left to identify; add base_frame and marker_position to"
+    require(len(found), f"{told} [model] effects, or free some parameters")
     return found
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -251,7 +251,7 @@ class Model(ByValue):
             (4, 4)
         """
         given_force(load, len(np.atleast_2d(q)))
-        poses = self.flange_poses(self.table(q, load), self._at(x))
+        poses = self.flange_poses(self.table(q, load).from_neither_side(), self._at(x))
         return poses[0] if np.ndim(q) == 1 else poses
 
     def with_markers_of(self, *tables: Measurements) -> Model:
@@ -442,6 +442,9 @@ class Model(ByValue):
         observed = observations or observe(table, self.observe)
         h, B = self.symbolic.regressor(row_inputs(self.symbolic.arm, table), x, columns=chosen)
         check_equilibrium(self, table, h)
+        if not np.isfinite(B.sum()):
+            row, column = np.argwhere(~np.isfinite(B).all(axis=1))[0]
+            no_number(table, row, self.names[chosen[column]])
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
 
@@ -484,13 +487,18 @@ def check_equilibrium(
     model: Model, table: Measurements, predicted: Array, remedy: str = NOMINAL
 ) -> None:
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
-    added = {p.effect for p in model.parameters} - BUILT_IN
+    added = {p.effect for p in model.parameters}.intersection(CATALOGUE) - BUILT_IN
     remedy += f"; or {listed(sorted(added))} of a plug-in gives no number there" * bool(added)
     for i in bad[:1]:
         raise InputError(
             f"{table.source}, line {table.row[i]}: no static equilibrium under this load "
             f"({len(bad)} rows); the compliances are too large for the force: {remedy}"
         )
+
+
+def no_number(table: Measurements, row: int, what: str) -> NoReturn:
+    told = "moves is no number there; look at the effect's expression and the row"
+    raise InputError(f"{table.source}, line {table.row[row]}: what {what} {told}")
 
 
 def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:

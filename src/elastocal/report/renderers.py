@@ -161,17 +161,16 @@ def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
 
 
 LIBRARIES = ("numpy", "scipy", "casadi")  # that the numbers depend on
-Inputs = Mapping[str, str] | Iterable[str | Path] | None
+Inputs = Mapping[str, str] | Iterable[str | Path] | str | Path | None
 
 
+@checked_arguments
 def write_page(
     result: Any, path: str | Path, inputs: Any = None, command: str | None = None,
     seed: int | None = None, **told: Any,
 ) -> None:  # fmt: skip
     """Arguments as for `page_of`; where no `inputs` are named, they are the files that the result
     came from.  A certificate whose name ends in .xml is a digital one (DCC)."""
-    found = type(path).__name__
-    require(isinstance(path, str | Path), f"{option('path')} takes a path; found {found}")
     path = Path(path)
     if told.get("certificate") and path.suffix.lower() == ".xml":
         from elastocal.report.smaller_views import dcc_text
@@ -382,7 +381,7 @@ def digests_of(inputs: Inputs) -> dict[str, str]:
     if inputs is None or isinstance(inputs, Mapping):
         return dict(inputs or {})
     found = {}
-    for path in inputs:
+    for path in [inputs] if isinstance(inputs, str | Path) else inputs:
         with open_input(path, "input file") as handle:
             found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
     return found

@@ -3,6 +3,7 @@ chain, its expression, its traits."""
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -144,6 +145,8 @@ class Arm:
 
     def input(self, name: str, size: int) -> ca.SX:
         """The row's value of a table quantity ("q", "force", "time", …), declared on first use."""
+        if name not in (*COLUMNS, "marker", "unmoved") and not name.startswith("level:"):
+            raise ValueError(f"arm.input takes {listed(sorted(COLUMNS), 9)}; found {name!r}")
         if name not in self.inputs:
             self.inputs[name] = ca.SX.sym(name, size)
         return self.inputs[name]
@@ -434,6 +437,12 @@ class Effect:
         """Change the instrument's reading."""
 
 
+AT = (
+    "joints", "turning joints", "links", "markers", "jointN", "linkN", "marker:NAME", "base",
+    "wrist", "tool", "load", "tracker", "arm", "all", "",
+)  # fmt: skip
+
+
 def check(effect: object) -> None:
     """InputError where `effect` cannot stand in the catalogue, and what it lacks."""
     check_registered(effect, Effect, "an effect", "joint_offset")
@@ -441,11 +450,14 @@ def check(effect: object) -> None:
     kind = type(effect)
     for key, given, known in (
         ("stage", (getattr(effect, "stage", None),), get_args(Stage)),
+        ("at", (re.sub("[1-9][0-9]*$", "N", re.sub(":.+", ":NAME", effect.at)),), AT),
         ("formats", effect.formats, get_args(Format)),
         ("needs", effect.needs, NEEDS),
     ):
         for found in given:
-            require(found in known, f"{kind.__name__}.{key} takes {listed(known)}; found {found!r}")
+            require(
+                found in known, f"{kind.__name__}.{key} takes {listed(known, 14)}; found {found!r}"
+            )
     hooks = ("shape", "load", "read")
     lacking = [] if kind.places is not Effect.places or kind.at else ["places"]
     lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]
