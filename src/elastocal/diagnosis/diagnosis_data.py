@@ -22,9 +22,10 @@ from elastocal.diagnosis.hypotheses import (
     SettingsGrid,
     compute_columns,
     grid_of,
-    moments_between,
+    moments_of_change,
     possible,
     recorded,
+    times_of,
 )
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
@@ -153,10 +154,9 @@ class DiagnosisData:
         return grids
 
     @cached_property
-    def moments(self) -> Array:
-        """Moments between visits at which something may have changed, if times are known."""
-        time = self.visits.time
-        return np.zeros(0) if time is None else moments_between(time)
+    def moments(self) -> tuple[Array, Array]:
+        """Moments between visits at which something may have changed, and their log prior."""
+        return moments_of_change(times_of(self.visits))
 
     def direction(self, h: Hypothesis, settings: Array) -> Array:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)

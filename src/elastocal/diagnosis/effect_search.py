@@ -173,7 +173,7 @@ def _refined(
     for _ in range(1 if len(settings) == 1 else REFINED_ROUNDS):
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
-                moments = dataset.moments
+                moments = dataset.moments[0]
                 steps = [moments[np.abs(moments - settings[s]) <= widths[s]] - settings[s]]
                 if len(steps[0]) <= 1 or len(moments) == len(np.unique(grid.values[:, s])):
                     continue

@@ -308,26 +308,36 @@ def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
     if setting.kind == "range":
         values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
     elif setting.kind == "change_time":
-        every = moments_between(times_of(visits))
-        evenly = np.linspace(0, len(every) - 1, min(len(every), CHANGE_TIMES))
-        values = every[evenly.round().astype(int)]
+        values, log_prior = moments_of_change(times_of(visits))
+        if len(values) > CHANGE_TIMES:  # as many between any two by their prior
+            sum_to = np.cumsum(np.exp(log_prior))
+            at = np.linspace(sum_to[0], sum_to[-1], CHANGE_TIMES)
+            k = np.unique(np.interp(at, sum_to, np.arange(len(values))).round().astype(int))
+            values, log_prior = values[k], log_prior[k] - logsumexp(log_prior[k])
     else:
         span = float(np.ptp(times_of(visits)))
         low, high = max(span / 20, setting.lower), min(3 * span, setting.upper)
         values = np.geomspace(min(low, high), high, TIME_CONSTANTS)
     step = np.gradient(values) if len(values) > 1 else np.ones(1)
-    return SettingsGrid(values[:, None], np.full(len(values), -np.log(len(values))), step[:, None])
+    if setting.kind != "change_time":
+        log_prior = np.full(len(values), -np.log(len(values)))
+    return SettingsGrid(values[:, None], log_prior, step[:, None])
 
 
 def times_of(visits: Measurements) -> Array:
     return by_rows(visits) if visits.time is None else visits.time
 
 
-def moments_between(time: Array) -> Array:
-    """Every moment between two visits, two visits at least on either side."""
+def moments_of_change(time: Array) -> tuple[Array, Array]:
+    """Every moment (n,) between two visits, two visits at least on either side, and the log of its
+    prior: half of it alike for all, half by how long there was for a change, as between sessions.
+    """
     known = np.sort(time)
-    middle = np.unique((known[1:-2] + known[2:-1]) / 2)
-    return middle if len(middle) else np.array([known.mean()])
+    moments, first = np.unique((known[1:-2] + known[2:-1]) / 2, return_index=True)
+    if not len(moments):
+        return np.array([known.mean()]), np.zeros(1)
+    lasted = known[first + 2] - known[first + 1]
+    return moments, np.log((1 / len(moments) + lasted / max(lasted.sum(), 1e-300)) / 2)
 
 
 def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
