@@ -195,10 +195,9 @@ def _targets(
     place, q = (None, points) if grid.joints else (points, None)
     targets = single.targets_at(option("table"), place, turned, "base", force, q)
     line = np.argsort(np.lexsort(points.T[::-1])) + 2  # of each in the file, below its header
-    # By columns of the time the base alone may move, and the targets with it.
-    time = np.zeros(n) if arm.model.cell.model.clock == "column" else None
+    # In time the base alone may move, and the targets with it.
     side = np.zeros((n, arm.model.chain.n_joints))
-    table = replace(targets.table, row=line, time=time, approach=side)
+    table = replace(targets.table, row=line, time=np.zeros(n), approach=side)
     return replace(targets, table=table, path=False)
 
 

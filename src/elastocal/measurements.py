@@ -328,7 +328,7 @@ NEVER_YET = 1e15  # as the line of a table: after all that were measured
 def by_rows(table: Measurements) -> Array:
     """The line (n,) at which each row's visit begins, for want of a time; after all lines of a
     campaign where the table has no readings, as poses have that the arm is still to visit."""
-    if table.position is None and table.distance is None:
+    if table.distance is None and (table.position is None or not table.position.any()):
         return np.full(len(table), NEVER_YET)
     return table.row[first_of_visit(table)].astype(np.float64)
 

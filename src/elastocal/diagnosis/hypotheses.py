@@ -17,6 +17,7 @@ from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
 from elastocal.engine import climb
 from elastocal.measurements import Measurements, by_rows, in_any_order
+from elastocal.messages import listed, require
 from elastocal.model.effects.base import (
     Arm,
     BaseMotion,
@@ -39,6 +40,7 @@ from elastocal.model.effects.geometry import (
     Backlash,
     GearSpectrum,
     Hysteresis,
+    Jump,
     ThermalExpansion,
 )
 from elastocal.model.effects.smooth import JointCurve
@@ -239,6 +241,12 @@ def with_recorded_drivers(model: Model, table: Measurements) -> Model:
     }
     if table.time is None and in_any_order(table):
         keys["clock"] = "rows"
+    elif table.time is not None and model.cell.model.clock == "rows":
+        by_rows = active & {name for name, e in CATALOGUE.items() if isinstance(e, Jump)}
+        told = f"{model.cell.source}: key model.clock: {listed(sorted(by_rows))} changed between"
+        remedy = "take it out, or identify and diagnose the table without times"
+        require(not by_rows, f"{told} rows of a table without times, which this one has; {remedy}")
+        keys["clock"] = "column"
     return with_keys(model, **keys) if keys else model
 
 

@@ -74,7 +74,6 @@ from elastocal.identification.start import (
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import (
-    NEVER_YET,
     Measurements,
     numbered,
     order_contradicted,
@@ -219,11 +218,10 @@ def _of_readings(covariance: Array | None, good: BoolArray, size: int) -> Array 
 
 
 def _test_errors(model: Model, result: Calibration, table: Measurements) -> TestErrors:
-    # What came before its first visit is not what came before that of the campaign.
-    table = replace(table, move=None, direction=None)
-    if table.time is None and model.cell.model.clock == "rows":  # after the campaign
-        table = replace(table, time=np.full(len(table), NEVER_YET))
     observed = observe(table, model.observe)
+    # What came before its first visit is not what came before that of the campaign, and its lines
+    # come after all of that: by `clock = "rows"` it is as poses that are still to be visited.
+    table = replace(table, move=None, direction=None, position=None, distance=None)
     error = observed.value - model.predict(table, result.x, observed)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
