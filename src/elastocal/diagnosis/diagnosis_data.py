@@ -18,6 +18,7 @@ from elastocal.diagnosis.hypotheses import (
     Columns,
     EntryKey,
     Hypothesis,
+    Moments,
     RegressorDirection,
     SettingsGrid,
     compute_columns,
@@ -148,15 +149,17 @@ class DiagnosisData:
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
-        grids = {h.key: grid_of(h, self.visits) for h in self.hypotheses if h.driven}
+        grids = {h.key: grid_of(h, self.visits, self.moments) for h in self.hypotheses if h.driven}
         for key, share in self.columns.shares.items():
             grids[key] = replace(NO_SETTINGS, log_prior=np.array([share]))
         return grids
 
     @cached_property
-    def moments(self) -> tuple[Array, Array]:
-        """Moments between visits at which something may have changed, and their log prior."""
-        return moments_of_change(times_of(self.visits))
+    def moments(self) -> Moments:
+        """At which something may have changed."""
+        return moments_of_change(
+            times_of(self.table)[self.lead], first_of_visit(self.table)[self.lead]
+        )
 
     def direction(self, h: Hypothesis, settings: Array) -> Array:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)

@@ -48,7 +48,7 @@ from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # What each need of an effect asks the user to record.
 RECORD = {
@@ -291,11 +291,11 @@ class SettingsGrid:
 NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
 
 
-def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
+def grid_of(hypothesis: Hypothesis, visits: Measurements, moments: Moments) -> SettingsGrid:
     """Grid of a hypothesis' settings for these visits; one empty point where it has none.  Of
     several settings, which are independent, it holds every combination.  Where those are more than
     MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long."""
-    axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
+    axes = [_axis(setting, hypothesis.where, visits, moments) for setting in hypothesis.settings]
     if not axes:
         return NO_SETTINGS
     count = [len(axis.values) for axis in axes]
@@ -310,13 +310,13 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
     )
 
 
-def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
+def _axis(setting: Setting, where: str, visits: Measurements, moments: Moments) -> SettingsGrid:
     if setting.kind == "order":
         return _orders(setting, where, visits)
     if setting.kind == "range":
         values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
     elif setting.kind == "change_time":
-        values, log_prior = moments_of_change(times_of(visits))
+        values, log_prior = moments
         if len(values) > CHANGE_TIMES:  # as many between any two by their prior
             sum_to = np.cumsum(np.exp(log_prior))
             at = np.linspace(sum_to[0], sum_to[-1], CHANGE_TIMES)
@@ -336,15 +336,26 @@ def times_of(visits: Measurements) -> Array:
     return by_rows(visits) if visits.time is None else visits.time
 
 
-def moments_of_change(time: Array) -> tuple[Array, Array]:
+Moments = tuple[Array, Array]
+
+
+def moments_of_change(time: Array, visit: IntArray) -> Moments:
     """Every moment (n,) between two visits, two visits at least on either side, and the log of its
     prior: half of it alike for all, half by how long there was for a change, as between sessions.
-    """
-    known = np.sort(time)
-    moments, first = np.unique((known[1:-2] + known[2:-1]) / 2, return_index=True)
+    `time` (readings,), and which `visit` each belongs to: no visit is cut in two, unless others
+    were made while it lasted."""
+    _, own = np.unique(visit, return_inverse=True)
+    begun, ended = np.full(own.max() + 1, np.inf), np.full(own.max() + 1, -np.inf)
+    np.minimum.at(begun, own, time)
+    np.maximum.at(ended, own, time)
+    order = np.argsort(begun, kind="stable")
+    low, high = begun[order][1:-2], begun[order][2:-1]
+    ended = ended[order][1:-2]
+    middle = (np.where(ended < high, ended, low) + high) / 2
+    moments, first = np.unique(middle, return_index=True)
     if not len(moments):
-        return np.array([known.mean()]), np.zeros(1)
-    lasted = known[first + 2] - known[first + 1]
+        return np.array([begun.mean()]), np.zeros(1)
+    lasted = (high - low)[first]
     return moments, np.log((1 / len(moments) + lasted / max(lasted.sum(), 1e-300)) / 2)
 
 
