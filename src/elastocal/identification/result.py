@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -250,8 +250,8 @@ def remedies() -> dict[str, str]:
         "settled).",
         "test_data_far": "Measure poses like those of the test: the fit extrapolates to them.",
         "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
-        "(joints, load), fit some like them; where they do not, the arm or the tracker has changed "
-        "in between.",
+        "(joints, load), fit some like them; where they do not, the arm, its markers or the "
+        "tracker have changed in between, or time_s of both counts from different moments.",
         "trust": "Use it (elastocal compensate, elastocal export) where poses and loads are like "
         "those measured.",
         "untested": "Validate on independent poses: measure some that are not fitted, and give "
@@ -574,12 +574,15 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
 
         It is the default point of `compensate`.  None where it is known as well, or not stated.
         """
-        tool, at = self.model.cell.tool, self.verdict.at
-        if not tool.load_point.any() or at is None:
+        cell, at, read = self.model.cell, self.verdict.at, self.observations
+        if not cell.tool.load_point.any() or at is None:
             return None
-        poses = prediction.over_the_workspace(self.model.cell, self.model, self.observations.table)
+        poses = prediction.over_the_workspace(cell, self.model, read.table)
+        like = read.table.take(np.resize(read.lead, FEW_POSES))  # in time and all else
+        table = replace(like, q=poses.q[:FEW_POSES], force=poses.force[:FEW_POSES])
         try:
-            found = self.position(poses.q[:FEW_POSES], poses.force[:FEW_POSES])
+            tool = calibrated.CalibratedTool(self.arm, calibrated.tool_point(cell, None))
+            found = prediction.position_at(tool, table, self.noise, self.spread)
         except ElastocalError:
             return None
         rms = float(np.sqrt(np.nanmean(np.trace(found.covariance, axis1=1, axis2=2))))
