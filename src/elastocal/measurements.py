@@ -282,8 +282,21 @@ def load_states(force: Array) -> IntArray:
 
 
 def visits(table: Measurements) -> IntArray:
-    """Number (n,) of each row's visit: its configuration, repeat and force."""
-    return numbered(table.configuration, table.repeat, load_states(table.force))
+    """Number (n,) of each row's visit: its configuration, repeat and force.  Between readings that
+    others part in the table and in time, as where one reflector is carried from marker to marker,
+    the arm has been elsewhere: those are several."""
+    number = numbered(table.configuration, table.repeat, load_states(table.force))
+    by_row, run = np.argsort(table.row, kind="stable"), np.zeros(len(table), dtype=np.int64)
+    run[by_row[1:]] = np.cumsum(np.diff(number[by_row]) != 0)
+    if table.time is None or run.max(initial=0) == number.max(initial=0):
+        return number
+    order, time = np.lexsort((table.time, number)), np.sort(table.time)
+    (a, b), between = (order[:-1], order[1:]), np.searchsorted
+    others = between(time, table.time[b]) > between(time, table.time[a], side="right")
+    apart = (number[a] == number[b]) & (run[a] != run[b]) & others
+    run[order[1:]] = np.cumsum(apart)
+    run[order[0]] = 0
+    return numbered(number, run)
 
 
 def first_of_visit(table: Measurements) -> IntArray:

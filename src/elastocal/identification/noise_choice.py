@@ -194,6 +194,15 @@ class Fitted(MixedFit):
         return [(d, v) for d, v in each if v > 0 or d.waves is not None]
 
     @property
+    def told(self) -> bool:
+        """Whether readings tell each of its own variances.  Those of one axis that the parameters
+        can all meet say nothing of theirs: it could be none, and they would decide all."""
+        e, own = self.expected, slice(self.noisy.own if self.model.prior is None else 0)
+        share = (np.diag(e.information) / np.maximum(0.5 * e.known, 1e-300))[own]
+        dof = share * self.noisy.readings.e.size / max(len(share), 1)
+        return len(share) < 2 or bool(dof.min() >= FEWEST)
+
+    @property
     def kind(self) -> Kind:
         """The kind without what was not found, with which it is the same model."""
         return self.noisy.kind.having(*(d.part for d, _ in self.found))
@@ -383,6 +392,8 @@ def estimate_noise(
     basis = replace(readings, B=Q.reshape(readings.B.shape))
     if like is not None:
         found = fitted(basis, Kind.parsed(like.kind), like.fit)
+        if like.trials and not found.told:
+            return _chosen(basis, T)
         return replace(like, fit=found, T=T, to_longest=0.0, over_times=None)
     asked = Kind.of(kind)
     if kind == "auto":
@@ -466,7 +477,7 @@ class _Choice:
         spent = len(shared) + (found.lasting is not None)
         criterion = float(own * self.price + 2 * spent - 2 * found.log_likelihood)
         self.trials[kind, lasting] = Trial(found.kind.name, own + spent, criterion)
-        if criterion < self.least:
+        if criterion < self.least and found.told:
             self.least, self.best = criterion, found
 
     def _changed(self) -> bool:
