@@ -291,11 +291,10 @@ def visits(table: Measurements) -> IntArray:
     if table.time is None or run.max(initial=0) == number.max(initial=0):
         return number
     order, time = np.lexsort((table.time, number)), np.sort(table.time)
-    (a, b), between = (order[:-1], order[1:]), np.searchsorted
-    others = between(time, table.time[b]) > between(time, table.time[a], side="right")
-    apart = (number[a] == number[b]) & (run[a] != run[b]) & others
-    run[order[1:]] = np.cumsum(apart)
-    run[order[0]] = 0
+    a, b = order[:-1], order[1:]
+    others = np.searchsorted(time, table.time[b]) > np.searchsorted(time, table.time[a], "right")
+    apart = (run[a] != run[b]) & others
+    run[order] = np.append(0, np.cumsum(apart))
     return numbered(number, run)
 
 

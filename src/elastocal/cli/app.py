@@ -43,14 +43,7 @@ from typer.core import TyperGroup
 from elastocal import __version__
 from elastocal.above import LARGEST_SEED, kinds_of
 from elastocal.files import TRACEBACK, check_output, explained, is_plugin_file, together
-from elastocal.messages import (
-    ElastocalError,
-    InputError,
-    flag_of,
-    json_text,
-    require,
-    saying,
-)
+from elastocal.messages import ElastocalError, InputError, flag_of, json_text, require, saying
 from elastocal.screen import complain, interrupts, progress_line, safe_console, say
 
 if TYPE_CHECKING:

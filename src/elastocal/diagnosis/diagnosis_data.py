@@ -53,8 +53,7 @@ class DiagnosisData:
     (scaled to their prior deviations) and noise shapes; `fitted` names the parameter of each of
     these columns, of the load point's the effect, of a stated drift's that of the base.
     `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a load.
-    `other_backlash` is the probability that play follows the backlash model that the base's model
-    does not have."""
+    `other_backlash` is the probability that play follows another backlash model than the base's."""
 
     base: Baseline
     columns: Columns
@@ -157,9 +156,8 @@ class DiagnosisData:
     @cached_property
     def moments(self) -> Moments:
         """At which something may have changed."""
-        return moments_of_change(
-            times_of(self.table)[self.lead], first_of_visit(self.table)[self.lead]
-        )
+        table, lead = self.table, self.lead
+        return moments_of_change(times_of(table)[lead], first_of_visit(table)[lead])
 
     def direction(self, h: Hypothesis, settings: Array) -> Array:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)

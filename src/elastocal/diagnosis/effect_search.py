@@ -27,12 +27,7 @@ from elastocal.diagnosis.baseline import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import (
-    NO_SETTINGS,
-    Hypothesis,
-    compute_columns,
-    with_keys,
-)
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.geometry import Backlash
 from elastocal.model.evaluate import ahead
@@ -329,8 +324,8 @@ class Slot:
     scores: Array
 
     def best_of(self, other: Slot) -> Slot:
-        """The higher score of each: both bound from below what it would be under the noise that
-        suits it best."""
+        """The higher score of each: both bound what it would be under the noise that suits it
+        best."""
         each = zip(self.items, other.items, other.scores > self.scores, strict=True)
         items = tuple(b if up else a for a, b, up in each)
         return Slot(items, np.maximum(self.scores, other.scores))
@@ -388,8 +383,7 @@ def about(
     apart: bool = False,
 ) -> DiagnosisData:  # fmt: skip
     """The data about a fit of the model with some of the hypotheses in it, at settings, what these
-    explain put back; `apart`: what they are to the model's own parameters is not in the columns of
-    these."""
+    explain put back; `apart`: columns of the model's own parameters are without them."""
     base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
     own = np.array([x[name] for name in base.model.names])
@@ -557,8 +551,8 @@ class ForwardSelection:
         return best, Slot(slot.items, scores)
 
     def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
-        """The set with each of the items more, its noise and settings fitted; kept, since they are
-        asked for again."""
+        """The set with each of the items more, its noise and settings fitted; kept to be asked
+        again."""
         dataset = self.dataset
         sets = [(*current.items, item) for item in added]
         keys = [tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in s) for s in sets]

@@ -169,7 +169,7 @@ def possible(
         searched = isinstance(effect, DrivenEffect) and not together
         kinds = {s.kind for each in settings.values() for s in each} if searched else set()
         needed = [*effect.needed(cell), *["time"] * bool(kinds & {"change_time", "time_constant"})]
-        if kinds == {"change_time"} and table.time is None and cell.model.clock == "rows":
+        if kinds == {"change_time"} and cell.model.clock == "rows":
             needed = [need for need in needed if need != "time"]
         if lacking := [need for need in needed if not recorded(table, need)]:
             reason, advice = RECORD[lacking[0]]
@@ -242,10 +242,11 @@ def with_recorded_drivers(model: Model, table: Measurements) -> Model:
     if table.time is None and in_any_order(table):
         keys["clock"] = "rows"
     elif table.time is not None and model.cell.model.clock == "rows":
-        by_rows = active & {name for name, e in CATALOGUE.items() if isinstance(e, Jump)}
-        told = f"{model.cell.source}: key model.clock: {listed(sorted(by_rows))} changed between"
-        remedy = "take it out, or identify and diagnose the table without times"
-        require(not by_rows, f"{told} rows of a table without times, which this one has; {remedy}")
+        by_rows = listed(sorted(name for name in active if isinstance(CATALOGUE[name], Jump)))
+        told = (
+            f"{model.cell.source}: key model.clock: {by_rows} is by rows of a table without times"
+        )
+        require(not by_rows, f"{told}, which this one has; take it out, or diagnose that table")
         keys["clock"] = "column"
     return with_keys(model, **keys) if keys else model
 
@@ -340,23 +341,19 @@ Moments = tuple[Array, Array]
 
 
 def moments_of_change(time: Array, visit: IntArray) -> Moments:
-    """Every moment (n,) between two visits, two visits at least on either side, and the log of its
-    prior: half of it alike for all, half by how long there was for a change, as between sessions.
-    `time` (readings,), and which `visit` each belongs to: no visit is cut in two, unless others
-    were made while it lasted."""
-    _, own = np.unique(visit, return_inverse=True)
-    begun, ended = np.full(own.max() + 1, np.inf), np.full(own.max() + 1, -np.inf)
-    np.minimum.at(begun, own, time)
-    np.maximum.at(ended, own, time)
+    """Every moment (n,) between two visits, two at least on either side, and the log of its prior:
+    half alike for all, half by how long there was for a change, as between sessions.  By the `time`
+    (readings,) and the `visit` of each: none is cut in two, unless others were made meanwhile."""
+    order = np.lexsort((time, visit))
+    t, last = time[order], np.flatnonzero(np.diff(visit[order], append=-1))
+    begun, ended = t[np.append(0, last[:-1] + 1)], t[last]
     order = np.argsort(begun, kind="stable")
-    low, high = begun[order][1:-2], begun[order][2:-1]
-    ended = ended[order][1:-2]
-    middle = (np.where(ended < high, ended, low) + high) / 2
-    moments, first = np.unique(middle, return_index=True)
+    low, high, ended = begun[order][1:-2], begun[order][2:-1], ended[order][1:-2]
+    moments, k = np.unique((np.where(ended < high, ended, low) + high) / 2, return_index=True)
     if not len(moments):
         return np.array([begun.mean()]), np.zeros(1)
-    lasted = (high - low)[first]
-    return moments, np.log((1 / len(moments) + lasted / max(lasted.sum(), 1e-300)) / 2)
+    share = (high - low)[k] / max((high - low)[k].sum(), 1e-300)
+    return moments, np.log((1 / len(moments) + share) / 2)
 
 
 def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
@@ -438,8 +435,7 @@ class StartSearch:
 
     @cached_property
     def screened(self) -> tuple[list[Start], float]:
-        """The best starts, the first of them refined, and the log of the mean likelihood over all
-        relative to the best one's."""
+        """The best starts, the first refined, and the log of the mean likelihood over the best."""
         starts = self.starts
         blocks = [slice(k, k + AT_ONCE) for k in range(0, len(starts), AT_ONCE)]
         each = [self._left(starts[block]) for block in blocks]

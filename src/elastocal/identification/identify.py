@@ -73,12 +73,7 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
-from elastocal.measurements import (
-    Measurements,
-    numbered,
-    order_contradicted,
-    past_midnight,
-)
+from elastocal.measurements import Measurements, numbered, order_contradicted, past_midnight
 from elastocal.messages import ElastocalError, InputError, listed, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.base import Parameter
@@ -132,7 +127,7 @@ def identify(
 def _doubts(
     model: Model, table: Measurements, test: Measurements | None, x: Array
 ) -> Iterator[str]:
-    """Moves out of order where an effect follows the last one, an arm that lies, a test of what was
+    """Moves out of order where an effect follows them, an arm that lies, a test of what was
     fitted."""
     if test is not None:
         read = [np.asarray(t.distance if t.position is None else t.position) for t in (table, test)]
@@ -557,8 +552,7 @@ COMPUTED = (
 
 
 def run_method(course: Course) -> MethodResult:
-    """Constraints and prior come last, on the weights and the readings that the method ends
-    with."""
+    """Constraints and prior come last, on the weights and readings that the method ends with."""
     options, smooth = course.options, course.every.problem.model.shrunk[course.free].any()
     if smooth:
         from elastocal.identification.smooth_fit import fit_smooth  # few models have any

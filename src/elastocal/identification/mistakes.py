@@ -25,13 +25,7 @@ from elastocal.cell_tables import Convention, ModelSpec, Tool
 from elastocal.identification.faulty_readings import FEWEST_POSES, MOST, POOR, exchanged
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
-from elastocal.identification.start import (
-    OF_A_TARGET,
-    OF_A_UNIT,
-    SCALED,
-    LinearFits,
-    Registration,
-)
+from elastocal.identification.start import OF_A_TARGET, OF_A_UNIT, SCALED, LinearFits, Registration
 from elastocal.measurements import Measurements
 from elastocal.messages import ElastocalError, InsufficientDataError, length, listed, rounded
 from elastocal.model.chain import Chain

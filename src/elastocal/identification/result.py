@@ -220,8 +220,7 @@ def more_poses() -> str:
 
 
 def remedies() -> dict[str, str]:
-    """What to do about findings of a kind, options named as messages do now; of others it depends
-    on more."""
+    """What to do about findings of a kind, options named as messages do; of others it depends."""
     return {
         "autocorrelated": "Visit poses and loads in random order and return to a reference pose "
         "every ten poses: residuals of visits that follow each other are alike, as where something "

@@ -55,14 +55,7 @@ from elastocal.planning.information import (
     plan_forces,
     with_noise_of,
 )
-from elastocal.planning.plan import (
-    Chance,
-    Gain,
-    Plan,
-    PlanSize,
-    predicted,
-    reasons,
-)
+from elastocal.planning.plan import Chance, Gain, Plan, PlanSize, predicted, reasons
 from elastocal.planning.poses import (
     Candidates,
     Pins,
