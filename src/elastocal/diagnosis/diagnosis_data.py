@@ -155,7 +155,6 @@ class DiagnosisData:
 
     @cached_property
     def moments(self) -> Moments:
-        """At which something may have changed."""
         table, lead = self.table, self.lead
         return moments_of_change(times_of(table)[lead], first_of_visit(table)[lead])
 

@@ -266,6 +266,7 @@ def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     return keys | {"clock": spec.clock} if changes and spec.clock != "column" else keys
 
 
+Moments = tuple[Array, Array]  # at which something may have changed, and their log prior
 CHANGE_TIMES = 120  # at most; more moments are refined after the search
 TIME_CONSTANTS = 8
 HIGHEST_ORDER, LOWEST_ORDER = 600.0, 2.5
@@ -335,9 +336,6 @@ def _axis(setting: Setting, where: str, visits: Measurements, moments: Moments) 
 
 def times_of(visits: Measurements) -> Array:
     return by_rows(visits) if visits.time is None else visits.time
-
-
-Moments = tuple[Array, Array]
 
 
 def moments_of_change(time: Array, visit: IntArray) -> Moments:
