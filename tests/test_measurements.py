@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pandas
 import pytest
 
 from elastocal import tables
-from elastocal.measurements import read_measurements, write_measurements
+from elastocal.measurements import read_measurements, visits, write_measurements
 from elastocal.messages import InputError
 
 HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
@@ -54,9 +55,6 @@ def table(*rows, header=HEADER):
 
 def extended(columns, values):
     return table(f"{ROW},{values}", header=f"{HEADER},{columns}")
-
-
-# --- what is read ---
 
 
 def test_the_smallest_table_has_defaults_for_all_the_rest(read):
@@ -132,9 +130,6 @@ def test_loads_and_repeats_tell_rows_of_one_configuration_apart(read):
     assert len(read(table(*rows, header=header))) == 4
 
 
-# --- the header ---
-
-
 @pytest.mark.parametrize(
     ("header", "told"),
     [
@@ -168,9 +163,6 @@ def test_wrong_header_is_told_before_any_row_is_looked_at(refusal, header, told)
 def test_what_is_observed_decides_the_columns_needed(refusal, observe, needed):
     header = HEADER if observe != "deflection" else "q1_deg,q2_deg"
     assert needed in refusal(header + "\n", observe=observe)
-
-
-# --- the rows ---
 
 
 @pytest.mark.parametrize(
@@ -214,9 +206,6 @@ def test_without_configurations_only_identical_rows_are_duplicates(read, refusal
     assert len(read(table(ROW + ",0", ROW + ",1", header=header))) == 2
 
 
-# --- the file ---
-
-
 @pytest.mark.parametrize(
     ("data", "told"),
     [
@@ -256,9 +245,6 @@ def test_a_table_read_in_pieces_is_the_same_table(read, small_chunks):
 def test_more_rows_than_any_campaign_has_are_refused(refusal, small_chunks, monkeypatch):
     monkeypatch.setattr(tables, "MAX_ROWS", 3)
     assert "more than 3 rows" in refusal(table(*(f"{i},2,3,4,5" for i in range(9))))
-
-
-# --- Parquet ---
 
 
 @pytest.fixture
@@ -305,12 +291,18 @@ def test_parquet_needs_an_engine_and_a_parquet_file(tmp_path, monkeypatch):
         read_measurements(path, joint_kinds=())
 
 
-# --- writing ---
+def test_a_marker_read_when_the_arm_has_come_back_is_another_visit(read):
+    """One reflector, carried from marker to marker: table and times say so, not one of them."""
+    rows = [f"{c},{m},{c},{ROW[2:]},{10 * c + 20 * (m == 'B')}" for m in "AB" for c in (1, 2)]
+    by_marker, by_pose = (
+        read(table(*each, header=f"configuration,marker,{HEADER},time_s"))
+        for each in (rows, sorted(rows))
+    )
+    assert visits(by_marker).tolist() == [0, 2, 1, 3]
+    assert visits(replace(by_marker, time=None)).max() == visits(by_pose).max() == 1
 
 
 def test_what_cannot_be_read_back_is_not_written(read, tmp_path):
-    from dataclasses import replace
-
     got = read(table(ROW))
     for wrong in (
         replace(got, position=got.position * np.nan),

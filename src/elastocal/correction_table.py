@@ -33,8 +33,8 @@ NOMINAL_MISS = 1e-5  # m
 
 @dataclass(frozen=True)
 class CorrectionGrid:
-    """Levels of each joint (rad or m), or of x, y, z (m, base frame) with one `rotation` (3, 3) of
-    the tool, None for any."""
+    """Levels of joints (rad or m), or of x, y, z (m, base frame) and a `rotation` (3, 3) or
+    None."""
 
     axes: tuple[Array, ...]
     joints: bool
@@ -150,8 +150,7 @@ def _mostly_inexact(
     arm: CalibratedArm, grid: CorrectionGrid, status: tuple[str, ...], point: ToolPoint,
     force: Array | None, seed: int,
 ) -> str:  # fmt: skip
-    """Some of the points are tried again away from the joint limits, and then with one joint moved,
-    to see what helps."""
+    """Some points are tried again away from the limits, then with one joint moved: what helps?"""
     told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: for most others "
     chain, beyond = arm.model.chain, "the command is out of the joint limits"
     if grid.joints:
@@ -195,10 +194,9 @@ def _targets(
     place, q = (None, points) if grid.joints else (points, None)
     targets = single.targets_at(option("table"), place, turned, "base", force, q)
     line = np.argsort(np.lexsort(points.T[::-1])) + 2  # of each in the file, below its header
-    # By columns of the time the base alone may move, and the targets with it.
-    time = np.zeros(n) if arm.model.cell.model.clock == "column" else None
+    # In time the base alone may move, and the targets with it.
     side = np.zeros((n, arm.model.chain.n_joints))
-    table = replace(targets.table, row=line, time=time, approach=side)
+    table = replace(targets.table, row=line, time=np.zeros(n), approach=side)
     return replace(targets, table=table, path=False)
 
 
@@ -226,8 +224,7 @@ def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> Ar
 
 
 def _between(one: Array, other: Array, oriented: bool) -> Array:
-    """(n, 6) from one pose (n, 4, 4) to another: p' − p, and the rotation vector of R' Rᵀ, zero
-    unless `oriented`."""
+    """(n, 6) between poses (n, 4, 4): p' − p, and the rotation vector of R' Rᵀ if `oriented`."""
     turned = np.zeros((len(one), 3))
     if oriented:
         change = other[:, :3, :3] @ one[:, :3, :3].transpose(0, 2, 1)

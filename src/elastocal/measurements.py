@@ -292,8 +292,20 @@ def load_states(force: Array) -> IntArray:
 
 
 def visits(table: Measurements) -> IntArray:
-    """Number (n,) of each row's visit: its configuration, repeat and force."""
-    return numbered(table.configuration, table.repeat, load_states(table.force))
+    """Number (n,) of each row's visit: its configuration, repeat and force.  Between readings that
+    others part in the table and in time, as where one reflector is carried from marker to marker,
+    the arm has been elsewhere: those are several."""
+    number = numbered(table.configuration, table.repeat, load_states(table.force))
+    by_row, run = np.argsort(table.row, kind="stable"), np.zeros(len(table), dtype=np.int64)
+    run[by_row[1:]] = np.cumsum(np.diff(number[by_row]) != 0)
+    if table.time is None or run.max(initial=0) == number.max(initial=0):
+        return number
+    order, time = np.lexsort((table.time, number)), np.sort(table.time)
+    a, b = order[:-1], order[1:]
+    others = np.searchsorted(time, table.time[b]) > np.searchsorted(time, table.time[a], "right")
+    apart = (run[a] != run[b]) & others
+    run[order] = np.append(0, np.cumsum(apart))
+    return numbered(number, run)
 
 
 def first_of_visit(table: Measurements) -> IntArray:
@@ -338,7 +350,7 @@ NEVER_YET = 1e15  # as the line of a table: after all that were measured
 def by_rows(table: Measurements) -> Array:
     """The line (n,) at which each row's visit begins, for want of a time; after all lines of a
     campaign where the table has no readings, as poses have that the arm is still to visit."""
-    if table.position is None and table.distance is None:
+    if table.distance is None and (table.position is None or not table.position.any()):
         return np.full(len(table), NEVER_YET)
     return table.row[first_of_visit(table)].astype(np.float64)
 

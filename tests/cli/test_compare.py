@@ -55,7 +55,7 @@ def test_after_a_collision_the_bent_link_is_named(folder, monkeypatch):
     code, out, err = run("cell.toml", "old.json", "bent.json", "-o", "c.json", "--report", "c.html")
     assert code == 0, err
     assert f"Verdict: The arm has changed: {BENT}." in (flat := " ".join(out.split()))
-    assert "the probability of any finding is 0.05 at most" in flat
+    assert "the probability that one is named is 0.05 at most" in flat
     found = json.loads(Path("c.json").read_text())
     assert (found["verdict"], found["changed"]) == ("changed", [BENT])
     (one,) = (p for p in found["parameters"] if p["changed"])

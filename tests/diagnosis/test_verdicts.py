@@ -13,7 +13,9 @@ import pytest
 import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell_tables import EffectChoice
+from elastocal.export.exportable import keep
 from elastocal.measurements import in_any_order
+from elastocal.model.calibrated import Conditions
 from elastocal.model.effects.catalogue import effect_of
 
 CASES = Path(__file__).parents[1] / "cases"
@@ -62,14 +64,25 @@ def test_readings_of_a_loaded_arm_that_lies_are_told() -> None:
     assert "−y of that frame points up" in told
 
 
-def test_a_jump_is_found_by_the_order_of_the_rows() -> None:
-    """Between configurations 33 and 34: its cell fits to the noise, and is not doubted."""
-    why = diagnosed("jump_untimed")
+@pytest.mark.parametrize("night", [None, 0.0, 86400.0])
+def test_a_jump_is_found_by_the_rows_or_by_times_of_readings(night, tmp_path: Path) -> None:
+    """Between configurations 33 and 34; its cell fits, and holds after it, whatever times say."""
+    case = CASES / "jump_untimed"
+    table = ec.Model(case / "cell.toml").read(case / "train.csv")
+    late = replace(table.take(table.row > 101), time=60.0 * np.arange(80))
+    time = None if night is None else 60.0 * table.row + night * (table.row > 100)
+    why = ec.diagnose(case / "cell.toml", replace(table, time=time))
     (jump,) = why.effects
     assert (why.verdict, jump.effect, jump.where) == ("explained", "encoder_jump", "joint3")
-    assert 98 < jump.settings["jump_time_s"] < 101
-    assert why.model_keys == {"clock": "rows"}
-    fit = ec.identify(CASES / "jump_untimed" / "cell.toml", CASES / "jump_untimed" / "train.csv")
+    assert jump.gap_reduction_ci95[0] > 0.6
+    if night is None:
+        assert 98 < jump.settings["jump_time_s"] < 101
+        assert why.model_keys == {"clock": "rows"}
+        why.save(tmp_path / "found.toml")
+        fit = ec.identify(tmp_path / "found.toml", table, test=late)
+        assert fit.test is not None and fit.test.rms < 1.2 * fit.heldout_rms
+        assert not keep(fit.arm, False, Conditions()).omissions
+    fit = ec.identify(case / "cell.toml", case / "train.csv")
     assert "as after a jump: ask diagnose" in fit.finding("faulty_readings").remedy
 
 

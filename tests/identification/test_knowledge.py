@@ -41,9 +41,6 @@ def readings(model: Model, seed: int, force=DOWN, **values: float) -> Measuremen
     return measured(model, plan, truth, SIGMA / 2**0.5, np.random.default_rng(seed))
 
 
-# --- priors -----------------------------------------------------------------------------------
-
-
 def test_a_prior_is_the_ridge_of_the_linear_arm():
     """MAP in closed form on an arm that is linear in its compliances."""
     model, table = drives(), readings(drives(), 4)
@@ -93,9 +90,6 @@ def test_a_prior_on_one_of_a_pair_tells_the_other():
     assert not {known, other} & {n for c in found.combinations for n in c.terms}
 
 
-# --- equalities -------------------------------------------------------------------------------
-
-
 def test_an_equality_is_the_fit_in_fewer_parameters():
     """joint2 = joint3 by adding their columns: x = T z on the linear arm."""
     model, table = drives(), readings(drives(), 8)
@@ -118,9 +112,6 @@ def test_an_equality_is_the_fit_in_fewer_parameters():
     assert found.sigma == pytest.approx(np.sqrt(e @ e / found.dof), rel=1e-9)
     told = found.finding("knowledge_contradicted").numbers["F"]
     assert told == pytest.approx(e @ e / free.sigma**2 - free.dof) and not found.verdict.trusted
-
-
-# --- the file ---------------------------------------------------------------------------------
 
 
 def test_the_file_shown_in_the_documentation_is_read(tmp_path):

@@ -58,9 +58,6 @@ def with_errors(table, share, seed=0):
     return replace(table, position=position)
 
 
-# --- methods --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_finds_the_truth_and_says_its_name(method):
     model, table, truth = campaign()
@@ -118,8 +115,6 @@ def test_computed_readings_give_the_true_values_and_no_noise(stated):
     assert np.abs(found - observe(exact, model.observe).value).max() < 1e-9
 
 
-# --- what configurations share ----------------------------------------------------------------
-
 SCATTER = "Configurations scatter more than their repeats"
 
 
@@ -154,9 +149,6 @@ def test_a_configuration_effect_is_told_and_the_default_counts_with_it():
     assert np.trace(result.covariance) > 2 * np.trace(plain.covariance)
     (common,) = (s for s in result.noise.sizes if s.name == "common to each configuration")
     assert 50e-6 < common.sigma < 200e-6  # 100 µm, from a handful of configurations
-
-
-# --- faulty readings ---------------------------------------------------------------------------
 
 
 def shifted(table, rows, by):

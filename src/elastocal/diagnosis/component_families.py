@@ -248,16 +248,18 @@ def _followed_by(dataset: DiagnosisData, found: FittedSum, where: str) -> Iterat
 def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
     """At the moment at which it explains most."""
     dataset = grams.dataset
-    moments, time = dataset.moments, dataset.visit_table.time
-    if time is None or not len(moments):
+    time = dataset.visit_table.time
+    if time is None:
         return None
+    moments, log_prior = dataset.moments
     entry, present = effect.entry_at(where), dataset.present
     key, when = (entry.name, (where,)), np.where(present, time.reshape(present.shape), -np.inf)
     evidence = grams.entry(key).steps(when, moments).evidence(MOTION * UNSIZED_SCALES)
-    moment = float(moments[np.argmax(evidence)])
+    k = int(np.argmax(evidence + log_prior))
+    moment = float(moments[k])
     begun = np.asarray(dataset.table.time)[first_of_visit(dataset.table)]
     D = (begun >= moment)[:, None, None] * MOTION * np.eye(entry.size)
-    return moved(dataset, key, D), {effect.constants[0].key: moment}, math.log(len(moments))
+    return moved(dataset, key, D), {effect.constants[0].key: moment}, -float(log_prior[k])
 
 
 def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) -> Tried | None:
@@ -568,8 +570,8 @@ class OrderPosterior:
         self.grams, self.scatter = grams_of[likeliest], tried[likeliest]
 
     def odds_near(self, order: float, m: int | None = None) -> float:
-        """Log odds of a family at this order, as far as these data resolve it, against none; of m
-        lines, or of any number."""
+        """Log odds of a family at this order, as far as data resolve it; of m lines, or any
+        number."""
         return self._odds(self._near(order, m))
 
     def _near(self, order: float, m: int | None = None) -> BoolArray:

@@ -18,13 +18,15 @@ from elastocal.diagnosis.hypotheses import (
     Columns,
     EntryKey,
     Hypothesis,
+    Moments,
     RegressorDirection,
     SettingsGrid,
     compute_columns,
     grid_of,
-    moments_between,
+    moments_of_change,
     possible,
     recorded,
+    times_of,
 )
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
@@ -51,8 +53,7 @@ class DiagnosisData:
     (scaled to their prior deviations) and noise shapes; `fitted` names the parameter of each of
     these columns, of the load point's the effect, of a stated drift's that of the base.
     `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a load.
-    `other_backlash` is the probability that play follows the backlash model that the base's model
-    does not have."""
+    `other_backlash` is the probability that play follows another backlash model than the base's."""
 
     base: Baseline
     columns: Columns
@@ -147,16 +148,15 @@ class DiagnosisData:
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
-        grids = {h.key: grid_of(h, self.visits) for h in self.hypotheses if h.driven}
+        grids = {h.key: grid_of(h, self.visits, self.moments) for h in self.hypotheses if h.driven}
         for key, share in self.columns.shares.items():
             grids[key] = replace(NO_SETTINGS, log_prior=np.array([share]))
         return grids
 
     @cached_property
-    def moments(self) -> Array:
-        """Moments between visits at which something may have changed, if times are known."""
-        time = self.visits.time
-        return np.zeros(0) if time is None else moments_between(time)
+    def moments(self) -> Moments:
+        table, lead = self.table, self.lead
+        return moments_of_change(times_of(table)[lead], first_of_visit(table)[lead])
 
     def direction(self, h: Hypothesis, settings: Array) -> Array:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)

@@ -168,7 +168,7 @@ def _refined(
     for _ in range(1 if len(settings) == 1 else REFINED_ROUNDS):
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
-                moments = dataset.moments
+                moments = dataset.moments[0]
                 steps = [moments[np.abs(moments - settings[s]) <= widths[s]] - settings[s]]
                 if len(steps[0]) <= 1 or len(moments) == len(np.unique(grid.values[:, s])):
                     continue
@@ -324,8 +324,8 @@ class Slot:
     scores: Array
 
     def best_of(self, other: Slot) -> Slot:
-        """The higher score of each: both bound from below what it would be under the noise that
-        suits it best."""
+        """The higher score of each: both bound what it would be under the noise that suits it
+        best."""
         each = zip(self.items, other.items, other.scores > self.scores, strict=True)
         items = tuple(b if up else a for a, b, up in each)
         return Slot(items, np.maximum(self.scores, other.scores))
@@ -383,8 +383,7 @@ def about(
     apart: bool = False,
 ) -> DiagnosisData:  # fmt: skip
     """The data about a fit of the model with some of the hypotheses in it, at settings, what these
-    explain put back; `apart`: what they are to the model's own parameters is not in the columns of
-    these."""
+    explain put back; `apart`: columns of the model's own parameters are without them."""
     base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
     own = np.array([x[name] for name in base.model.names])
@@ -552,8 +551,8 @@ class ForwardSelection:
         return best, Slot(slot.items, scores)
 
     def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
-        """The set with each of the items more, its noise and settings fitted; kept, since they are
-        asked for again."""
+        """The set with each of the items more, its noise and settings fitted; kept to be asked
+        again."""
         dataset = self.dataset
         sets = [(*current.items, item) for item in added]
         keys = [tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in s) for s in sets]

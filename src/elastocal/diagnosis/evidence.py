@@ -151,9 +151,8 @@ Flips = tuple[Array, Array]
 
 
 class SignedResiduals(NamedTuple):
-    """T residuals that differ by the `signs` (T, C) of their configurations: P times one of them is
-    s V⁻¹e − H h, with `of` V⁻¹e (C, m), or its products (C, …) with the motions of an entry, and
-    h (T, p)."""
+    """T residuals that differ by the `signs` (T, C) of their configurations: P times one is s V⁻¹e
+    − H h, with `of` V⁻¹e (C, m), or its products (C, …) with an entry's motions, and h (T, p)."""
 
     signs: Array
     of: Array
@@ -306,8 +305,7 @@ HELD = 300_000
 
 @dataclass
 class Grams:
-    """Spectra against `data` under the noise of its projection `at`, and against `flips`, where
-    these are given."""
+    """Spectra against `data` under the noise of its projection `at`, and against any `flips`."""
 
     dataset: DiagnosisData
     data: NoisyData

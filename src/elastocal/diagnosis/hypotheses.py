@@ -17,6 +17,7 @@ from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
 from elastocal.engine import climb
 from elastocal.measurements import Measurements, by_rows, in_any_order
+from elastocal.messages import listed, require
 from elastocal.model.effects.base import (
     Arm,
     BaseMotion,
@@ -39,6 +40,7 @@ from elastocal.model.effects.geometry import (
     Backlash,
     GearSpectrum,
     Hysteresis,
+    Jump,
     ThermalExpansion,
 )
 from elastocal.model.effects.smooth import JointCurve
@@ -46,7 +48,7 @@ from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model, no_number
 from elastocal.model.observations import observe
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # What each need of an effect asks the user to record.
 RECORD = {
@@ -167,7 +169,7 @@ def possible(
         searched = isinstance(effect, DrivenEffect) and not together
         kinds = {s.kind for each in settings.values() for s in each} if searched else set()
         needed = [*effect.needed(cell), *["time"] * bool(kinds & {"change_time", "time_constant"})]
-        if kinds == {"change_time"} and table.time is None and cell.model.clock == "rows":
+        if kinds == {"change_time"} and cell.model.clock == "rows":
             needed = [need for need in needed if need != "time"]
         if lacking := [need for need in needed if not recorded(table, need)]:
             reason, advice = RECORD[lacking[0]]
@@ -239,6 +241,13 @@ def with_recorded_drivers(model: Model, table: Measurements) -> Model:
     }
     if table.time is None and in_any_order(table):
         keys["clock"] = "rows"
+    elif table.time is not None and model.cell.model.clock == "rows":
+        by_rows = listed(sorted(name for name in active if isinstance(CATALOGUE[name], Jump)))
+        told = (
+            f"{model.cell.source}: key model.clock: {by_rows} is by rows of a table without times"
+        )
+        require(not by_rows, f"{told}, which this one has; take it out, or diagnose that table")
+        keys["clock"] = "column"
     return with_keys(model, **keys) if keys else model
 
 
@@ -257,6 +266,7 @@ def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     return keys | {"clock": spec.clock} if changes and spec.clock != "column" else keys
 
 
+Moments = tuple[Array, Array]  # at which something may have changed, and their log prior
 CHANGE_TIMES = 120  # at most; more moments are refined after the search
 TIME_CONSTANTS = 8
 HIGHEST_ORDER, LOWEST_ORDER = 600.0, 2.5
@@ -283,11 +293,11 @@ class SettingsGrid:
 NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
 
 
-def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
+def grid_of(hypothesis: Hypothesis, visits: Measurements, moments: Moments) -> SettingsGrid:
     """Grid of a hypothesis' settings for these visits; one empty point where it has none.  Of
     several settings, which are independent, it holds every combination.  Where those are more than
     MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long."""
-    axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
+    axes = [_axis(setting, hypothesis.where, visits, moments) for setting in hypothesis.settings]
     if not axes:
         return NO_SETTINGS
     count = [len(axis.values) for axis in axes]
@@ -302,32 +312,46 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
     )
 
 
-def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
+def _axis(setting: Setting, where: str, visits: Measurements, moments: Moments) -> SettingsGrid:
     if setting.kind == "order":
         return _orders(setting, where, visits)
     if setting.kind == "range":
         values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
     elif setting.kind == "change_time":
-        every = moments_between(times_of(visits))
-        evenly = np.linspace(0, len(every) - 1, min(len(every), CHANGE_TIMES))
-        values = every[evenly.round().astype(int)]
+        values, log_prior = moments
+        if len(values) > CHANGE_TIMES:  # as many between any two by their prior
+            sum_to = np.cumsum(np.exp(log_prior))
+            at = np.linspace(sum_to[0], sum_to[-1], CHANGE_TIMES)
+            k = np.unique(np.interp(at, sum_to, np.arange(len(values))).round().astype(int))
+            values, log_prior = values[k], log_prior[k] - logsumexp(log_prior[k])
     else:
         span = float(np.ptp(times_of(visits)))
         low, high = max(span / 20, setting.lower), min(3 * span, setting.upper)
         values = np.geomspace(min(low, high), high, TIME_CONSTANTS)
     step = np.gradient(values) if len(values) > 1 else np.ones(1)
-    return SettingsGrid(values[:, None], np.full(len(values), -np.log(len(values))), step[:, None])
+    if setting.kind != "change_time":
+        log_prior = np.full(len(values), -np.log(len(values)))
+    return SettingsGrid(values[:, None], log_prior, step[:, None])
 
 
 def times_of(visits: Measurements) -> Array:
     return by_rows(visits) if visits.time is None else visits.time
 
 
-def moments_between(time: Array) -> Array:
-    """Every moment between two visits, two visits at least on either side."""
-    known = np.sort(time)
-    middle = np.unique((known[1:-2] + known[2:-1]) / 2)
-    return middle if len(middle) else np.array([known.mean()])
+def moments_of_change(time: Array, visit: IntArray) -> Moments:
+    """Every moment (n,) between two visits, two at least on either side, and the log of its prior:
+    half alike for all, half by how long there was for a change, as between sessions.  By the `time`
+    (readings,) and the `visit` of each: none is cut in two, unless others were made meanwhile."""
+    order = np.lexsort((time, visit))
+    t, last = time[order], np.flatnonzero(np.diff(visit[order], append=-1))
+    begun, ended = t[np.append(0, last[:-1] + 1)], t[last]
+    order = np.argsort(begun, kind="stable")
+    low, high, ended = begun[order][1:-2], begun[order][2:-1], ended[order][1:-2]
+    moments, k = np.unique((np.where(ended < high, ended, low) + high) / 2, return_index=True)
+    if not len(moments):
+        return np.array([begun.mean()]), np.zeros(1)
+    share = (high - low)[k] / max((high - low)[k].sum(), 1e-300)
+    return moments, np.log((1 / len(moments) + share) / 2)
 
 
 def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
@@ -409,8 +433,7 @@ class StartSearch:
 
     @cached_property
     def screened(self) -> tuple[list[Start], float]:
-        """The best starts, the first of them refined, and the log of the mean likelihood over all
-        relative to the best one's."""
+        """The best starts, the first refined, and the log of the mean likelihood over the best."""
         starts = self.starts
         blocks = [slice(k, k + AT_ONCE) for k in range(0, len(starts), AT_ONCE)]
         each = [self._left(starts[block]) for block in blocks]

@@ -240,8 +240,10 @@ class SupportedFloor:
         stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
         moved = np.moveaxis(data.G * np.sqrt(smooth), 2, 0)
         self.joints = np.array([mean_square(data, g) for g in moved])
-        self.instrument = above * mean_square(data, stated)
-        variance = max(fitted**2 - self.joints.sum() - self.instrument, 0.0)
+        self.instrument = above * (reading := mean_square(data, stated))
+        # However much the joints would scatter, readings have their own noise.
+        own = noise.factor**2 * reading - self.instrument
+        variance = max(fitted**2 - self.joints.sum() - self.instrument, own)
         total, dof = repeats(dataset, come_back=True)
         self.near_repeats, alike = near_repeats(dataset, data, self.at), dataset.common**2
         common = min(size * alike, variance)

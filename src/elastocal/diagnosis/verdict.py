@@ -33,7 +33,7 @@ from elastocal.diagnosis.effect_search import (
     settings_of,
 )
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
-from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
+from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, times_of
 from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
 from elastocal.identification.solve import FAR, far_off
@@ -170,8 +170,8 @@ class FewAnswer(SumAnswer):
         return super()._error_without([*gone, *self._unnamed])  # which no cell has that is written
 
     def _mistimed(self, k: int) -> Array:
-        """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
-        moment at which item k changes and the one at which it was found to."""
+        """Mean square (draws,) in m² of new readings, one as soon after any visit as after another,
+        between the moment at which item k changes and the one at which it was found to."""
         chosen, every = self.selected.chosen, times_of(self.dataset.visits)
         item, time = chosen.items[k], np.unique(every)
         kinds = [setting.kind for setting in item.what.settings]
@@ -179,10 +179,10 @@ class FewAnswer(SumAnswer):
             return np.zeros(DRAWS)
         s = kinds.index("change_time")
         tried, p, _ = self._constants[k][s]
-        # Between the two visits at any moment.
+        # Between the two visits at any moment, counted in visits: none are read at night.
         after = np.searchsorted(time, self.rng.choice(tried[:, s], DRAWS, p=p))
-        moment = self.rng.uniform(time[after - 1], time[after])
-        apart = np.abs(moment - item.settings[s]) / np.ptp(time)
+        found = np.interp(item.settings[s], time, np.arange(len(time)))
+        apart = np.abs(after - self.rng.uniform(size=DRAWS) - found) / (len(time) - 1)
         n_new = NEW_POSES * round(len(every) / len(self.dataset.blocks.member))
         step = mean_square(chosen.data, chosen.signal(k)) / (every > item.settings[s]).mean()
         return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
@@ -204,7 +204,7 @@ class FewAnswer(SumAnswer):
         found, setting = item.settings[s], item.what.settings[s]
         grid = dataset.grids[item.what.key]
         if setting.kind == "change_time":
-            values = moments_between(np.unique(times_of(self.dataset.visits)))
+            values = self.dataset.moments[0]
             values = values[np.argsort(np.abs(values - found))[:CHANGE_TIMES]]
         elif setting.kind == "time_constant":  # as probable from here to twice it as to half of it
             ends = grid.values[:, s]

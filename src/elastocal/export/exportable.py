@@ -20,14 +20,14 @@ from scipy.optimize import lsq_linear
 
 from elastocal.cell_tables import EffectChoice, Tool
 from elastocal.files import read_text
-from elastocal.measurements import Measurements
+from elastocal.measurements import NEVER_YET, Measurements
 from elastocal.messages import InputError, InsufficientDataError, option, require
 from elastocal.model import calibrated, rigid
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued
 from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.base import Format, Spring, row_inputs
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
-from elastocal.model.effects.geometry import JointOffset, LinkGeometry
+from elastocal.model.effects.geometry import JointOffset, Jump, LinkGeometry
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
@@ -81,6 +81,8 @@ def keep(arm: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
     file has no column of measured torques."""
     instrument = tuple(name for name in arm.effects if CATALOGUE[name].of_the_measurement)
     unstated = calibrated.unstated_needs(arm, conditions)
+    if arm.model.cell.model.clock == "rows":  # what changed between two lines has changed
+        unstated |= {name: [] for name in unstated if isinstance(CATALOGUE[name], Jump)}
     stated = {name for name, needs in unstated.items() if not needs}
     full, omissions = calibrated.arm_with(arm, stated), list[Omission]()
     format: Format = "elastic" if elastic else "rigid"
@@ -196,6 +198,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     model, symbolic = part.model, part.model.symbolic
     arm = symbolic.arm
     given = {"time": conditions.time, "temperature": conditions.temperature}
+    given["moment"] = NEVER_YET if model.cell.model.clock == "rows" else conditions.time
     inputs = [np.full(s.shape[0], given.get(name) or 0.0) for name, s in arm.inputs.items()]
     expressions = [
         ca.vertcat(*arm.q),
@@ -340,8 +343,7 @@ class JointCorrection:
     curves: Mapping[tuple[int, str], tuple[Array, Array]] = field(default_factory=dict)
 
     def __call__(self, q: ArrayLike, approach: ArrayLike | None = None) -> NDArray:
-        """Joints to command (joints,) or (n, joints); without `approach`, like q, no curve that
-        follows it counts."""
+        """Joints to command (joints,) or (n, joints); without `approach`, like q, no such curve."""
         given = np.asarray(q, dtype=float)
         sides = np.zeros_like(given) if approach is None else np.asarray(approach, dtype=float)
         found = given.copy()

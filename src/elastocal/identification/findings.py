@@ -142,9 +142,8 @@ def _explained(result: Calibration, noise: list[Finding]) -> bool:
 
 
 def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
-    """Residuals of visits that follow each other, by a permutation test.  Where the noise
-    explains the residual, what they share is a small part of it, for which the error at new
-    poses has room."""
+    """Residuals of visits that follow each other, by a permutation test.  Where noise explains the
+    residual, what they share is a small part, for which the error at new poses has room."""
     found = result.autocorrelation
     if found is None or found.p >= SCATTERS:
         return
@@ -486,8 +485,7 @@ def shape_of(summary: ResidualSummary) -> Finding:
 
 
 def _test(result: Calibration) -> Iterator[Finding]:
-    """Test data against held-out poses, by an F-test of the two mean squares; a reading's
-    components count as one."""
+    """Test data against held-out poses, by an F-test; a reading's components count as one."""
     test, held = result.test, result.heldout_rms
     if test is None:
         yield _note("untested")
@@ -591,8 +589,7 @@ DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
 
 
 def warning_sentences(result: Calibration) -> dict[str, str]:
-    """The findings that call for attention as sentences, with the kind of each; of those alike one
-    sentence."""
+    """The findings that call for attention as sentences, with the kind of each; alike ones once."""
     groups: dict[Any, list[Finding]] = {}
     for k, f in enumerate(result.findings):
         beyond = f.kind == "beyond_bound"

@@ -128,7 +128,7 @@ def identify(
 def _doubts(
     model: Model, table: Measurements, test: Measurements | None, x: Array
 ) -> Iterator[str]:
-    """Moves out of order where an effect follows the last one, an arm that lies, a test of what was
+    """Moves out of order where an effect follows them, an arm that lies, a test of what was
     fitted."""
     if test is not None and (twice := fitted_too(test, table)):
         yield (
@@ -544,8 +544,7 @@ COMPUTED = (
 
 
 def run_method(course: Course) -> MethodResult:
-    """Constraints and prior come last, on the weights and the readings that the method ends
-    with."""
+    """Constraints and prior come last, on the weights and readings that the method ends with."""
     options, smooth = course.options, course.every.problem.model.shrunk[course.free].any()
     if smooth:
         from elastocal.identification.smooth_fit import fit_smooth  # few models have any

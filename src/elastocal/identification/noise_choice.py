@@ -149,8 +149,8 @@ class NoisyReadings:
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
 
     def start(self, like: Fitted | None = None) -> Array:
-        """Variances (K,) of `like` where it has them; else own ones from the residuals, and shared
-        ones a tenth of these."""
+        """Variances (K,) of `like` where it has them; else by the residuals, shared ones a
+        tenth."""
         sets, size, e2 = self.sets, self.readings.size, (self.sets.e**2).mean(axis=1)
         # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
         unit = np.trace(self.structure.matrix.sum(axis=1), axis1=1, axis2=2)[sets.first] / size
@@ -192,6 +192,14 @@ class Fitted(MixedFit):
     def found(self) -> list[tuple[Deviation, float]]:
         each = zip(self.noisy.deviations, self.common.tolist(), strict=True)
         return [(d, v) for d, v in each if v > 0 or d.waves is not None]
+
+    @property
+    def told(self) -> bool:
+        """Whether readings tell each of its own variances.  Those of one axis that the parameters
+        can all meet say nothing of theirs: it could be none, and they would decide all."""
+        own = self.noisy.own if self.model.prior is None else 0
+        share = np.diag(self.expected.information)[:own] / (0.5 * self.expected.known[:own])
+        return own < 2 or bool(share.min() * self.noisy.readings.e.size / own >= FEWEST)
 
     @property
     def kind(self) -> Kind:
@@ -383,6 +391,8 @@ def estimate_noise(
     basis = replace(readings, B=Q.reshape(readings.B.shape))
     if like is not None:
         found = fitted(basis, Kind.parsed(like.kind), like.fit)
+        if like.trials and not found.told:
+            return _chosen(basis, T)
         return replace(like, fit=found, T=T, to_longest=0.0, over_times=None)
     asked = Kind.of(kind)
     if kind == "auto":
@@ -410,8 +420,7 @@ def _chosen(readings: Readings, T: Array) -> NoiseFit:
 
 
 def supported(readings: Readings) -> list[str]:
-    """Structures whose variances the table can tell.  What is stated is believed until something
-    else is better."""
+    """Structures whose variances the table can tell; what is stated until something is better."""
     names = [name for name, model in STRUCTURES.items() if model.supports(readings)]
     return sorted(names, key=lambda name: name != "stated")
 
@@ -452,8 +461,7 @@ class _Choice:
     def attempt(
         self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
     ) -> None:
-        """Fit a kind of noise, unless it is `found`, and keep it where it is better than what there
-        is."""
+        """Fit a kind of noise, unless it is `found`, and keep it where it is better."""
         if (kind, lasting) in self.trials:
             return
         try:
@@ -466,7 +474,7 @@ class _Choice:
         spent = len(shared) + (found.lasting is not None)
         criterion = float(own * self.price + 2 * spent - 2 * found.log_likelihood)
         self.trials[kind, lasting] = Trial(found.kind.name, own + spent, criterion)
-        if criterion < self.least:
+        if criterion < self.least and found.told:
             self.least, self.best = criterion, found
 
     def _changed(self) -> bool:
@@ -592,8 +600,7 @@ def weights_sharing(
 
 
 def with_stated_sharing(own: Weights, model: Model, observed: Observations, x: Array) -> Weights:
-    """The weights `own` of single readings with what `[noise]` of the cell says that they share, as
-    a simulation draws it."""
+    """The weights `own` of single readings with what `[noise]` of the cell says that they share."""
     if not model.cell.noise.shared or own.whiten is None or not own.absolute:
         return own
     stated = [(d, 1.0) for d in stated_deviations(model, observed, x)]

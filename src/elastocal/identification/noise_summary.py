@@ -30,7 +30,7 @@ from elastocal.identification.weighted_problem import (
     stated_by_observation,
     weights_for,
 )
-from elastocal.measurements import Measurements, numbered
+from elastocal.measurements import Measurements, numbered, visits
 from elastocal.messages import InputError, load_text
 from elastocal.model.observations import COMPONENTS, Observations, pure_error
 from elastocal.units import Array, BoolArray, IntArray, microns
@@ -78,8 +78,7 @@ def single_readings(
         return None
     root = inverse_factor(stated)
     e = np.einsum("nij,nj->ni", root, residual.reshape(n, 3))
-    table, lead = observed.table, observed.lead
-    visit = numbered(observed.configuration, observed.load, table.repeat[lead])
+    visit = visits(observed.table)[observed.lead]
     square, dof, by = *_of_bodies(observed, root, e, visit), "markers of one pose"
     if dof < FEWEST and repeats:
         square, dof = pure_error(observed.place, e)

@@ -221,8 +221,7 @@ def more_poses() -> str:
 
 
 def remedies() -> dict[str, str]:
-    """What to do about findings of a kind, options named as messages do now; of others it depends
-    on more."""
+    """What to do about findings of a kind, options named as messages do; of others it depends."""
     return {
         "autocorrelated": "Visit poses and loads in random order and return to a reference pose "
         "every ten poses: residuals of visits that follow each other are alike, as where something "
@@ -249,8 +248,8 @@ def remedies() -> dict[str, str]:
         "settled).",
         "test_data_far": "Measure poses like those of the test: the fit extrapolates to them.",
         "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
-        "(joints, load), fit some like them; where they do not, the arm or the tracker has changed "
-        "in between.",
+        "(joints, load), fit some like them; where they do not, the arm, its markers or the "
+        "tracker have changed in between, or time_s of both counts from different moments.",
         "trust": "Use it (elastocal compensate, elastocal export) where poses and loads are like "
         "those measured.",
         "untested": "Validate on independent poses: measure some that are not fitted, and give "
@@ -577,12 +576,15 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
 
         It is the default point of `compensate`.  None where known as well, unstated, or deflected.
         """
-        tool, at = self.model.cell.tool, self.verdict.at
-        if not tool.load_point.any() or at is None or self.model.observe == "deflection":
+        cell, at, read = self.model.cell, self.verdict.at, self.observations
+        if not cell.tool.load_point.any() or at is None or cell.model.observe == "deflection":
             return None
-        poses = prediction.over_the_workspace(self.model.cell, self.model, self.observations.table)
+        poses = prediction.over_the_workspace(cell, self.model, read.table)
+        like = read.table.take(np.resize(read.lead, FEW_POSES))  # in time and all else
+        table = replace(like, q=poses.q[:FEW_POSES], force=poses.force[:FEW_POSES])
         try:
-            found = self.position(poses.q[:FEW_POSES], poses.force[:FEW_POSES])
+            tool = calibrated.CalibratedTool(self.arm, calibrated.tool_point(cell, None))
+            found = prediction.position_at(tool, table, self.noise, self.spread)
         except ElastocalError:
             return None
         rms = float(np.sqrt(np.nanmean(np.trace(found.covariance, axis1=1, axis2=2))))
@@ -647,8 +649,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         fitted = self.observations.table
         if prediction.fitted_too(table, fitted):
             return table
-        if self.model.cell.model.clock == "rows" and fitted.time is None:
-            table = replace(table, time=np.full(len(table), NEVER_YET))
+        if self.model.cell.model.clock == "rows":
+            table = replace(table, row=table.row + int(NEVER_YET))
         return table.from_neither_side()
 
     @property

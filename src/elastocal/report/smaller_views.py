@@ -87,7 +87,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
          f"random poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone "
          f"gives {noise} rms."),
         ("Chance", f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by "
-         "Holm's rule: if nothing has changed, the probability of any finding is "
+         "Holm's rule: if nothing has changed, the probability that one is named is "
          f"{c.level:g} at most."),
         ("Compared", "The arm itself. Base and markers are set up anew each time: a change that a "
          "motion of the base or the markers also explains is not seen."),

@@ -238,9 +238,11 @@ def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
         return (known_moves == 0).astype(np.float64)
     if name in ("move", "direction") and getattr(table, name) is None:
         table = with_moves(table)
+    if name == "moment":  # by which something has changed
+        if arm.cell.model.clock == "rows":
+            return by_rows(table)[:, None]
+        name = "time"
     value = getattr(table, name)
-    if name == "time" and value is None and arm.cell.model.clock == "rows":
-        value = by_rows(table)
     told = f"the model needs the column {COLUMNS[name]}, which the table lacks"
     require(value is not None, f"{table.source}: {told}")
     return np.asarray(value[:, None] if value.ndim == 1 else value)

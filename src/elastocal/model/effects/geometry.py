@@ -251,7 +251,7 @@ class Jump(WarmUp):
     any_size = True
 
     def course(self, arm: Arm, p: Symbols) -> ca.SX:
-        return arm.input("time", 1) >= p[self.constants[0].key]
+        return arm.input("moment", 1) >= p[self.constants[0].key]
 
 
 JUMP_TIME = Setting("jump_time_s", "change_time", None, -np.inf, np.inf)
