@@ -62,8 +62,6 @@ def test_the_joints_of_the_pose_before_tell_the_moves_in_any_order(tmp_path: Pat
     table = campaign()
     mixed = shuffled(replace(table, before=table.q - table.move))
     mixed.save(tmp_path / "data.csv")
-    read, moves = (
-        ec.Model(CELL).read(tmp_path / "data.csv"),
-        dict(zip(table.row, table.move, strict=True)),
-    )
+    read = ec.Model(CELL).read(tmp_path / "data.csv")
+    moves = dict(zip(table.row, table.move, strict=True))
     np.testing.assert_allclose(read.move, [moves[row] for row in mixed.row], atol=1e-9)

@@ -28,11 +28,7 @@ from elastocal.diagnosis.component_search import (
 )
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
-from elastocal.diagnosis.effect_search import (
-    MANY,
-    ForwardSelection,
-    with_likelier_backlash_model,
-)
+from elastocal.diagnosis.effect_search import MANY, ForwardSelection, with_likelier_backlash_model
 from elastocal.diagnosis.hypotheses import (
     BY_LAST_MOVE,
     OUT_OF_ORDER,
@@ -56,12 +52,7 @@ from elastocal.diagnosis.verdict import (
 from elastocal.files import atomic_writer, is_plugin_file, read_text
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.identify import misread_for_a_while
-from elastocal.identification.mistakes import (
-    POOREST,
-    length_of,
-    likely_mistake,
-    refuse_nonsense,
-)
+from elastocal.identification.mistakes import POOREST, length_of, likely_mistake, refuse_nonsense
 from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty, named_runs
 from elastocal.identification.scrutiny import BudgetStep, autocorrelation
 from elastocal.identification.start import (

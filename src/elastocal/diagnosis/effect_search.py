@@ -27,12 +27,7 @@ from elastocal.diagnosis.baseline import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import (
-    NO_SETTINGS,
-    Hypothesis,
-    compute_columns,
-    with_keys,
-)
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.geometry import Backlash
 from elastocal.model.evaluate import ahead
