@@ -104,9 +104,8 @@ def test_a_cause_far_larger_than_usual_is_named_and_to_be_confirmed() -> None:
     """A gear of 51 teeth for 50: so large that it is not linear."""
     fault = Fault("encoder_scale", "joint3", {"encoder_scale": 0.02})
     model, _ = campaign()
-    why = ec.diagnose(
-        model, measured(model.chain, model.cell, [fault], plan(model.chain, 24, 1), 1)
-    )
+    table = measured(model.chain, model.cell, [fault], plan(model.chain, 24, 1), 1)
+    why = ec.diagnose(model, table)
     (found,) = why.effects
     assert (found.effect, found.where) == fault.key and why.gap.explained < 2 * why.gap.noise_floor
     assert abs(found.parameters[0].value - 0.02) < 4 * found.parameters[0].std
@@ -118,9 +117,8 @@ def test_a_ripple_is_named_with_its_order_and_amplitude() -> None:
     (found,), fault = diagnosed(RIPPLE).effects, FAULTS[RIPPLE]
     assert (found.effect, found.where) == fault.key
     assert found.settings["ripple_order"] == pytest.approx(fault.settings["ripple_order"], abs=0.2)
-    size, true = (
-        np.hypot(*v) for v in ([p.value for p in found.parameters], fault.values.values())
-    )
+    both = [p.value for p in found.parameters], fault.values.values()
+    size, true = (np.hypot(*v) for v in both)
     assert size == pytest.approx(true, abs=4 * max(p.std for p in found.parameters))
 
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from support.calibration import random_chain
 from support.cells import kr270_chain
-from support.diagnosis_data import Fault, campaign, cell, measured, plan
+from support.diagnosis_data import FAULTS, campaign, cell, measured, plan
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.cell_tables import Nominal
+from elastocal.cell_tables import EffectChoice, Nominal
 from elastocal.diagnosis.baseline import thinned
 from elastocal.messages import InsufficientDataError
 from elastocal.model.manipulator import Model
@@ -58,12 +58,25 @@ def test_positions_without_load_time_approach_and_further_markers() -> None:
     assert d.verdict != "nothing_significant"
 
 
+def test_what_weights_do_to_a_joint_or_a_marker_is_no_gear_error() -> None:
+    plain = cell(("base_frame", "joint_offset", "marker_position:marker:M1"), link_gravity=False)
+    model, (_, table) = Model.assembled(kr270_chain(), plain), campaign(n=60)
+    bare = table.take((table.force[:, 2] == 0) & (table.marker == 0))
+    sagging = model.with_effects((*plain.model.effects, EffectChoice("gravity_sag", "joint2")))
+    read = ec.simulate(sagging, bare, values={"joint2.sag_1": 1e-4}, seed=0)
+    d = ec.diagnose(model, read.take(read.marker == 0))
+    assert any((c.effect, c.where) == ("gravity_sag", "joint2") for c in d.indistinguishable[0])
+    read = ec.simulate(model, bare, seed=0).take(read.marker == 0)
+    down = model.flange_poses(bare, model.nominal)
+    aside = 1e-4 * np.sign(down[:, 2, :1]) * down[:, :3, 0]
+    d = ec.diagnose(model, replace(read, position=read.position + aside))
+    assert d.verdict == "unknown_effect" and d.location.where == "marker:M1"
+
+
 def test_arms_of_other_numbers_of_joints(n_joints: int = 4) -> None:
     chain = random_chain(3, n_joints)
     plain = cell(nominal=Nominal(joint_compliance=(1e-6,) * n_joints), link_gravity=False)
-    fault = Fault(
-        "gear_eccentricity", "joint3", {"eccentricity_sin": 2e-4, "eccentricity_cos": -1.5e-4}
-    )
+    fault = replace(FAULTS[ECCENTRIC], where="joint3")
     table = measured(chain, plain, [fault], plan(chain, 20, n_joints, PULL), n_joints)
     d = ec.diagnose(Model.assembled(chain, plain), table)
     assert key(d) == fault.key and d.verdict in ("explained", "ambiguous")
@@ -81,11 +94,10 @@ def test_missing_readings_and_unequal_repeats() -> None:
     model, table = campaign("encoder_scale:joint3")
     rng = np.random.default_rng(0)
     again = np.flatnonzero((table.configuration % 4 == 0) & (table.marker < 2))
-    extra = table.take(again)
-    noise = 1e-5 * rng.normal(size=extra.position.shape)
+    moved = table.position[again] + 1e-5 * rng.normal(size=(len(again), 3))
     both = table.take(np.concatenate([np.arange(len(table)), again]))
-    repeat = np.concatenate([table.repeat, extra.repeat + 1])
-    position = np.concatenate([table.position, extra.position + noise])
+    repeat = np.concatenate([table.repeat, table.repeat[again] + 1])
+    position = np.concatenate([table.position, moved])
     both = replace(both, row=np.arange(len(both)) + 2, repeat=repeat, position=position)
     d = ec.diagnose(model, both.take(rng.random(len(both)) > 0.2))
     assert d.verdict == "explained" and key(d) == ("encoder_scale", "joint3")

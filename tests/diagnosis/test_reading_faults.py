@@ -62,9 +62,7 @@ def test_a_visit_that_its_repeats_contradict_is_faulty() -> None:
 
 
 @pytest.mark.parametrize("kind", ["lag", pytest.param("curves", marks=pytest.mark.long)])
-def test_distances_of_the_markers_tell_the_faulty_readings_of_an_arm_unlike_its_model(
-    kind: str,
-) -> None:
+def test_markers_tell_the_faulty_readings_of_an_arm_unlike_its_model(kind: str) -> None:
     """Every move leaves it short by a different part, or all its joints have curves of errors."""
     chain, plain, n = kr270_chain(), cell(RIGID, link_gravity=False, nominal=Nominal()), 30
     q = random_poses(chain, n, 1)

@@ -49,9 +49,8 @@ def test_a_gap_of_twelve_times_the_noise_is_not_nothing() -> None:
     why = diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
     gap = why.gap
     assert why.verdict == "unknown_effect" and why.probability_nothing < 0.02
-    assert gap.unexplained > 5 * gap.noise_floor
     left = (gap.explained**2 - gap.noise_floor**2) ** 0.5
-    assert 0.5 * left < gap.unexplained < 1.05 * left
+    assert max(5 * gap.noise_floor, 0.5 * left) < gap.unexplained < 1.05 * left
 
 
 def test_readings_of_a_loaded_arm_that_lies_are_told() -> None:
@@ -94,8 +93,7 @@ def test_in_a_sorted_table_a_step_is_no_jump() -> None:
     by_joint_1 = np.lexsort((table.configuration, table.q[:, 0]))
     moved = replace(table.take(by_joint_1), row=table.row, move=None, direction=None)
     why = ec.diagnose(case / "cell.toml", moved)
-    assert not any("jump" in c.effect for c in why.candidates)
-    assert why.verdict == "unknown_effect"
+    assert why.verdict == "unknown_effect" and "jump" not in str([c.effect for c in why.candidates])
 
 
 def test_what_only_the_prior_holds_of_a_cause_is_no_number() -> None:

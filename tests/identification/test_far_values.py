@@ -227,6 +227,8 @@ def test_pairs_of_mistakes(made):
     offset[:, 2] *= -1
     told = "with offset_deg 90 at joint 2 and with the sign of joint 3 turned"
     assert told in refusal(path, replace(table, q=offset))
+    part = np.where(table.row[:, None] > 60, table.q * [1, 1, 1, -1, 1, 1], table.q)
+    assert "of lines 61–" in (told := refusal(path, replace(table, q=part))) and "joint 4" in told
 
 
 def test_one_row_that_closed_up_lets_markers_change_places(made):

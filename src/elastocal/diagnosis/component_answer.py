@@ -559,7 +559,9 @@ class SumAnswer:
         self, name: str, where: str, members: list[int], probability: float
     ) -> FoundEffect:
         settings, fall = self._settings(members), self._reduction(members)
-        parameters = tuple(p for k in members for p in self._parameters(k))
+        known = [k for k in members if (h := self.found.components[k].hypothesis)
+                 and not any(p.shrunk for p in h.parameters)]  # fmt: skip
+        parameters = tuple(p for k in known for p in self._parameters(k))
         return FoundEffect(name, where, probability, *fall, parameters, settings)
 
     @cached_property
@@ -613,11 +615,10 @@ class SumAnswer:
                     yield p.key, size * s
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
-        """Estimates of a component's parameters, where they are few and not shrunk; deviations by
-        draws, which know no sizes either, nor whether what is hidden is there."""
+        """Estimates of a component's parameters; deviations by draws, which know no sizes either,
+        nor whether what is hidden is there."""
         c = self.found.components[k]
-        if c.hypothesis is None or any(p.shrunk for p in c.hypothesis.parameters):
-            return
+        assert c.hypothesis is not None
         span, sizes = self.found.spans[k], self.dataset.sizes[c.hypothesis.key]
         mean, D = sizes * self._fitted.beta[span], self._fitted.beta_deviation[:, span]
         apart = self._drawn[span] - self._fitted.beta[span, None]

@@ -521,8 +521,7 @@ def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:
     offset = table.position - cell.tracker.position
     middle, half = (offset.max(axis=0) + offset.min(axis=0)) / 2, np.ptp(offset, axis=0) / 2
     field = monomials((offset - middle) / np.maximum(half, 1e-9)) * MOTION
-    shift = np.zeros((n, base.observed.size, 3))
-    shift[:, :3] = np.eye(3)
+    shift = np.broadcast_to(np.eye(base.observed.size, 3), (n, base.observed.size, 3))
 
     def of_rows(columns: Array, functions: Array) -> Array:
         rows = np.einsum("nsd,nf->nsdf", columns, functions)
@@ -530,11 +529,12 @@ def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:
 
     columns = of_rows(shift, field)
     yield Generic("field", "position in the workspace", "tracker", "tracker", columns=columns)
-    # The unit vector from each marker to the instrument, in the flange frame.
+    # Where instrument and weight draw each marker, in the flange frame.
     R = base.model.flange_poses(table, base.x)[:, :3, :3]
     line = -offset / np.linalg.norm(offset, axis=1, keepdims=True)
-    view = monomials(np.einsum("nij,ni->nj", R, line)) * MOTION
-    for marker in cell.tool.markers:
-        place = f"marker:{marker}"
-        columns = of_rows(dataset.columns.entry(("marker_motion", (place,))), view)
-        yield Generic("view", f"angle of view of {marker}", place, "tool", columns=columns)
+    for name, way in (("angle of view", line), ("weight's direction", -np.eye(3)[[2] * n])):
+        along = monomials(np.einsum("nij,ni->nj", R, way)) * MOTION
+        for marker in cell.tool.markers:
+            place = f"marker:{marker}"
+            columns = of_rows(dataset.columns.entry(("marker_motion", (place,))), along)
+            yield Generic("view", f"{name} of {marker}", place, "tool", columns=columns)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import SMALLEST_NOISE, Baseline, NoiseValues, fit_baseline
+from elastocal.diagnosis.baseline import SHARED, SMALLEST_NOISE, Baseline, NoiseValues, fit_baseline
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible, with_keys
@@ -123,10 +123,8 @@ def _hidden(base: Baseline, q: Array, forces: Array) -> BoolArray:
 def load_forces(table: Measurements) -> Array:
     """The table's usual load states (L, 3) N; the mean load where every visit has its own."""
     _, first = np.unique(visits(table), return_index=True)
-    force = table.force[first]
-    _, group, count = np.unique(
-        np.round(force / NEWTON), axis=0, return_inverse=True, return_counts=True
-    )
+    force, kinds = table.force[first], np.round(table.force[first] / NEWTON)
+    _, group, count = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
     usual = np.flatnonzero(count >= RARE * len(force))
     loaded, group = np.any(force != 0, axis=1), group.ravel()
     if not len(usual) or (loaded.any() and not loaded[np.isin(group, usual)].any()):
@@ -161,6 +159,8 @@ def discriminations(
     dataset, found = diagnosis_data_of(both, list(every)), diagnosis.noise
     joint = np.maximum(found.repeatability, SMALLEST_NOISE)
     shared = np.array(found.shared_by_joint or [found.shared] * len(joint))
+    if not shared.any():  # nor told apart where no configuration is visited twice
+        shared, joint = np.full_like(joint, SHARED), joint / np.hypot(1.0, SHARED)
     noise = NoiseValues(found.stated_factor, joint, shared)
     faulty = np.isin(pool.table.row[observed.lead], [f.line for f in found.faulty])
     dataset = dataset.without(faulty | pool.hidden[observed.lead])
@@ -271,17 +271,13 @@ def plan_extra(
         picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
         before, after = (share * expected(tasks, some) for some in ((), chosen))
         by_chance = share * float(np.mean([expected(tasks, pick) for pick in picks]))
+    inseparable = tuple(names for c in tasks for names in c.inseparable)
+    rivals = tuple(dict.fromkeys(name for s in sets for name in s.names))
+    pairs = tuple(pair for c in tasks for pair in c.pairs(chosen))
+    plan = measuring_order(pool, chosen, base.observed.table) if chosen else None
+    told = (none,) if none else tuple(advice)
     return ExtraPlan(
-        separable=bool(chosen),
-        inseparable=tuple(names for c in tasks for names in c.inseparable),
-        n_poses=len(chosen),
-        rivals=tuple(dict.fromkeys(name for s in sets for name in s.names)),
-        pairs=tuple(pair for c in tasks for pair in c.pairs(chosen)),
-        plan=measuring_order(pool, chosen, base.observed.table) if chosen else None,
-        probability_before=before,
-        probability_after=after,
-        probability_random=by_chance,
-        advice=(none,) if none else tuple(advice),
+        bool(chosen), inseparable, len(chosen), rivals, pairs, plan, before, after, by_chance, told
     )
 
 

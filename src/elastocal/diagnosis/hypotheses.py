@@ -153,9 +153,9 @@ def possible(
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():
-        asked = (
-            effect.together and not corrects(effect) if together else effect.may_be_missing(cell)
-        )
+        asked = effect.may_be_missing(cell)
+        if together:
+            asked = effect.together and not (asked or corrects(effect))
         if name in without or not asked or (effect.unless and recorded(table, effect.unless)):
             continue
         places = [
@@ -166,7 +166,7 @@ def possible(
         settings = {w: effect.settings(w, chain, cell) for w in places}
         # Only a driven effect can be evaluated at many settings; others' stay as the model has
         # them.
-        searched = isinstance(effect, DrivenEffect) and not together
+        searched = isinstance(effect, DrivenEffect) and not effect.together
         kinds = {s.kind for each in settings.values() for s in each} if searched else set()
         needed = [*effect.needed(cell), *["time"] * bool(kinds & {"change_time", "time_constant"})]
         if kinds == {"change_time"} and cell.model.clock == "rows":

@@ -28,6 +28,7 @@ from elastocal.identification.faulty_readings import (
     exchanged,
     in_one_frame,
 )
+from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
 from elastocal.identification.start import (
@@ -562,11 +563,17 @@ def refuse_nonsense(
     # Of those set apart too: beside them the few that fit say nothing.
     error, rms = every_off
     many = f", {share:.0%} of them more than {rounded(POOREST * length, 2)} m," * (share > FEW)
+    cause = ""
+    if many and (fit is None or not fit.mended):  # a part of the table may be wrong by itself
+        parts = [each.table.row[each.lead] for each in (observed, apart) if each is not None]
+        far = np.unique(np.concatenate(parts)[off > POOREST * length])
+        if cause := likely_mistake(model, every.take(np.isin(every.row, far))):
+            cause = f"of lines {listed(named_runs(far.tolist()), 4)} alone {cause}"
     value = f", whose {beyond[0][0]} is {rounded(beyond[0][1])} m" if beyond else ""
     raise InsufficientDataError(
         f"{table.source}: after the fit the readings are {rounded(error)} m (median) and "
         f"{rounded(rms)} m (rms){many} from the model{value}, which no arm of {rounded(length)} m "
-        f"could be; {_cause(every, fit)}"
+        f"could be; {cause or _cause(every, fit)}"
     )
 
 

@@ -339,6 +339,7 @@ class GravitySag(DrivenEffect):
     """
 
     name, stage, at = "gravity_sag", "transmission", "turning joints"
+    remedy = RECORD_TORQUES
     constants = (Setting("sag_size_rad", "range", 2e-4, 1e-12, 1.0),)
     together = True
     family = "gravity"
@@ -351,6 +352,9 @@ class GravitySag(DrivenEffect):
     def acts(self, place: str, chain: Chain, cell: Cell) -> bool:
         turned = cell.model.nominal.base_rotation
         return feels_weight(chain, index(place), (np.eye(3) if turned is None else turned)[2])
+
+    def may_be_missing(self, cell: Cell) -> bool:
+        return not any(e.name == JointCompliance.name for e in cell.model.effects)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         up, j = arm.T_tracker_base[2, :3].T, index(place)
