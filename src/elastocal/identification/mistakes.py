@@ -22,12 +22,7 @@ import scipy  # whose `spatial` loads where rotations were read
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import Convention, ModelSpec, Tool
-from elastocal.identification.faulty_readings import (
-    FEWEST_POSES,
-    MOST,
-    exchanged,
-    in_one_frame,
-)
+from elastocal.identification.faulty_readings import FEWEST_POSES, MOST, exchanged, in_one_frame
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
