@@ -349,7 +349,7 @@ def compensate(
         oriented, force, T, placed, task.errors(nominal, every)[0],
         _uncertainty(tool, search.rows, q, reached), (),
     )  # fmt: skip
-    told = [*_of_loads(arm, result), *_of_places(arm, result)]
+    told = [*arm.doubted, *_of_loads(arm, result), *_of_places(arm, result)]
     if targets.path or targets.q is None:  # not of a grid of joints
         # Joints alone say themselves how far to move.
         turned = jumps(task, q, reached & (targets.position is not None))
@@ -485,7 +485,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     if len(unknown) and rms > max(WORTH_TELLING, float(np.sqrt(np.mean(std**2)))):
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
-            f"this point depends: typical deviations of them would move it by {length(rms)} rms, "
+            f"this point depends: typical deviations would move it by {length(rms)} rms, "
             "which within95_um counts and std_um leaves out; "
             + f"choose a marker that was fitted ({option('point')}), or " * (not c.point.marker)
             + "measure what is missing"
@@ -508,16 +508,17 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     far = reached & (sure.std > shown.most)
     if shown.chance(int(far.sum()), int(reached.sum())) >= UNLIKELY:
         return
-    outside = far.copy()
-    outside[far] = _std_of_markers(arm, c, far) > shown.most
+    own, outside = sure.std.copy(), far.copy()
+    own[far] = _std_of_markers(arm, c, far)
+    outside[far] = own[far] > shown.most
     several = outside.sum() > 1
-    for which, told, remedy in (
-        (far & ~outside, f"where the {c.point.told} lies on the tool is hardly known",
+    for which, std, told, remedy in (
+        (far & ~outside, sure.std, f"where the {c.point.told} lies on the tool is hardly known",
          f"measure a marker there, or choose a marker that was fitted ({option('point')})"),
-        (outside, f"{'these targets are' if several else 'this target is'} outside the measured "
-         "poses", "measure poses there"),
+        (outside, own, f"{'these targets are' if several else 'this target is'} outside the "
+         "measured poses", "measure poses there"),
     ):  # fmt: skip
-        most, at_poses = length(sure.std[which].max(initial=0.0)), length(shown.most)
+        most, at_poses = length(std[which].max(initial=0.0)), length(shown.most)
         sizes = f"(standard deviation {most} at most, at measured poses {at_poses})"
         yield from _told(c.targets, which, f"{told} {sizes}; {remedy}")
 

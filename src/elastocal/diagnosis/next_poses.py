@@ -167,7 +167,8 @@ def next_poses(
     model = model.with_markers_of(table)
     asked = _asked(model.cell, table, batch, candidates)
     shares_of(asked, batch, "batch")  # each level takes a pose
-    unstated, why, fit, sure, lacking = lacks_noise(asked), None, None, math.inf, 0.0
+    unstated, why, fit = lacks_noise(asked), None, None
+    sure, known, lacking = math.inf, math.inf, 0.0
     if len(np.unique(table.configuration)) >= FEWEST:
         tell("diagnosing")
         why = diagnose(model, table, DiagnosisOptions(seed), tell)
@@ -175,15 +176,20 @@ def next_poses(
     tell("identifying")
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table, new_poses=used_poses(model.cell, model.chain))
-        sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
-    cell = replace(model.cell, design=asked.design)
-    cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
+        sure, known, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
+    cell, notes = replace(model.cell, design=asked.design), tuple[str, ...]()
+    if fit is not None and (unstated or fit.finding("stated_noise_too_small")):
+        cell, notes = with_noise_of(cell, fit)
     options = DesignOptions("batch", seed, jobs, done=table, notes=notes, hold=True)
     plan = design(cell, options, progress=tell)
     assert plan.gain is not None  # the criterion has test poses
-    own = plan.gain.sure
-    reached = max(own, sure) if sure else math.hypot(own, lacking)
-    plan = replace(plan, gain=(gain := plan.gain.lacking(lacking, reached)))
+    gain = plan.gain
+    reached = max(gain.sure, sure) if sure else math.hypot(gain.sure, lacking)
+    if gain.sure > APART * sure > 0:
+        # The plan's figures take for unknown what identify holds within its typical deviations.
+        reached = sure
+        gain = gain if gain.after > known else replace(gain, before=known, model_before=known)
+    plan = replace(plan, gain=(gain := gain.lacking(lacking, reached)))
     required = model.cell.require.new_poses if require is None else require
     verdict = verdict_of(gain, reached, required, least_gain)
     return NextPoses(
@@ -202,19 +208,21 @@ def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell
     ))  # fmt: skip
 
 
-def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
-    """The error at new poses that is kept with 95 %, and what the model lacks of it, in m; 0 and
-    that of distances, of which no position follows: the plan's own figures say it.  That
-    configurations scatter beyond their noise is lack of fit with the probability that something
-    `unknown` is at work; else it is their noise."""
+def _error_now(fit: Calibration, unknown: float) -> tuple[float, float, float]:
+    """The error at new poses that is kept with 95 %, and of it what parameters and what the model
+    lacks give, in m; of distances the last alone: no position follows, and the plan's own figures
+    say it.  That configurations scatter beyond their noise is lack of fit with the probability that
+    something `unknown` is at work; else it is their noise."""
     model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
     if observed.kind == "distance":
-        return 0.0, math.sqrt(3 * excess.squared.mean()) if excess else 0.0
+        return 0.0, 0.0, math.sqrt(3 * excess.squared.mean()) if excess else 0.0
     cell, table = model.cell, observed.table
     poses = used_poses(cell, model.chain) or over_the_workspace(cell, model, table)
     error = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
-    return (math.inf, 0.0) if error is None else (error.sure, error.lacking or 0.0)
+    if error is None:
+        return math.inf, math.inf, 0.0
+    return error.sure, math.hypot(error.parameters, error.open), error.lacking or 0.0
 
 
 def verdict_of(
