@@ -345,7 +345,7 @@ def compensate(
         np.column_stack([before[:, 1], after[:, 1]]), _status(search, after, nominal), goals,
         oriented, force, T, placed, task.errors(nominal, every)[0], sure, of_turn, (),
     )  # fmt: skip
-    told = [*_of_loads(arm, result), *_of_places(arm, result)]
+    told = [*arm.doubted, *_of_loads(arm, result), *_of_places(arm, result)]
     if targets.path or targets.q is None:  # not of a grid of joints
         # Joints alone say themselves how far to move.
         turned = jumps(task, q, reached & (targets.position is not None))
@@ -482,7 +482,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     if (rms := _open(sure, reached)) is not None:
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
-            f"this point depends: typical deviations of them would move it by {length(rms)} rms, "
+            f"this point depends: typical deviations would move it by {length(rms)} rms, "
             "which within95_um counts and std_um leaves out; "
             + f"choose a marker that was fitted ({option('point')}), or " * (not c.point.marker)
             + "measure what is missing"

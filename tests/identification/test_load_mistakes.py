@@ -69,11 +69,21 @@ def test_the_unit_of_the_loads_is_named_with_its_direction(made):
 
 def test_a_load_in_the_opposite_direction_is_named_and_not_trusted(made):
     """No spring is negative by many standard deviations, and nothing is hardly shown there."""
-    fit = fitted(made, -1.0)
+    (path, table), fit = made, fitted(made, -1.0)
     verdict = fit.to_json()["verdict"]
     assert verdict["tone"] == "poor" and fit.finding("hardly_shown") is None
-    assert "compliance of joints 2, 3, 4, 5 and 6 negative" in verdict["sentence"]
+    said = "do not use this calibration: impossible values: compliance of joints 2, 3, 4, 5 and 6"
+    assert said in verdict["doubt"]
     assert "most likely the sign of the force columns is wrong" in verdict["sentence"]
+    fit.save(result := path.with_name("turned.json"))
+    for arm in (fit.arm, ec.read_calibrated(path, result)):  # who uses it is told so
+        commands = ec.compensate(arm, [[1.8, 0.0, 0.9]], load=(0, 0, -2000))
+        arm.save(file := path.with_name("turned.urdf"))
+        changes = " ".join(str(ec.compare(arm, arm)).split())
+        assert all(said in text for text in (commands.warnings[0], file.read_text(), changes))
+        assert "Use the new" not in changes
+    why = ec.diagnose(path, replace(table, force=-table.force))
+    assert "which no spring is: do not use this model. Check the sign" in why.warnings[0]
     told = " ".join(str(fit).split())
     assert "Check the sign of the force columns: where z points up, force_z_N" in told
     assert "Beyond a physical bound, so without a value (95 %): joint2.compliance (-0.3" in told

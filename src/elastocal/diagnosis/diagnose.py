@@ -46,6 +46,7 @@ from elastocal.diagnosis.verdict import (
     confirm,
     structure_tests,
     too_small,
+    turned_loads,
     unheard_of,
     warnings,
 )
@@ -259,13 +260,14 @@ def _diagnosed(
         nothing = min(nothing, FALSE_SMOOTH)
     return Diagnosis(
         **answers,
-        candidates=candidates(dataset, few),
+        candidates=candidates(dataset, few, () if answers["groups"] else answers["effects"]),
         structure=tests,
         probability_nothing=nothing,
         p_value=p,
         untested=(*untested, *small),
         warnings=(
             *told,
+            *turned_loads(dataset, found.nothing.noise),
             *filter(None, [solved_body(left, float(base.residual.std())), turned]),
             *warnings(dataset, found, suspects, answers["noise"]),
             *confirm(unheard_of(answers["effects"], base.model)),

@@ -23,7 +23,7 @@ from elastocal.diagnosis.rivals import (
     rival_sets,
 )
 from elastocal.measurements import Measurements, visits, with_moves
-from elastocal.messages import InsufficientDataError, counted, option, rounded
+from elastocal.messages import InsufficientDataError, counted, option, rounded, together
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.observations import observe
 from elastocal.planning.execution import nearest_first
@@ -298,8 +298,8 @@ def _advice(
         near = f"they would be {d:.1f} standard deviations apart"
         if len(names) > 2:
             near = f"each would be within {d:.1f} standard deviations of another of them"
-        together = " and ".join([", ".join(names[:-1]), names[-1]])
-        yield f"no pose separates {together}: measured in all {N} poses that were tried {near}"
+        alike = f"no pose separates {together(names)}, which count as one"
+        yield f"{alike}: measured in all {N} poses that were tried {near}"
     effects = dict.fromkeys(name.partition(":")[0] for names in groups for name in names)
     yield from dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy))
     if share < MOSTLY:

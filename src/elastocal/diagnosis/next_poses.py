@@ -176,8 +176,9 @@ def next_poses(
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table, new_poses=used_poses(model.cell, model.chain))
         sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
-    cell = replace(model.cell, design=asked.design)
-    cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
+    cell, notes = replace(model.cell, design=asked.design), tuple[str, ...]()
+    if fit is not None and (unstated or fit.finding("stated_noise_too_small")):
+        cell, notes = with_noise_of(cell, fit)
     options = DesignOptions("batch", seed, jobs, done=table, notes=notes, hold=True)
     plan = design(cell, options, progress=tell)
     assert plan.gain is not None  # the criterion has test poses

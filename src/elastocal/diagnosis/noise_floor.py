@@ -34,6 +34,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.identification.identify import left_out
 from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
+from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.identification.outliers import settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import numbered, rounded_joints
@@ -190,7 +191,8 @@ def _next_to(x: Array) -> tuple[IntArray, IntArray]:
 
 CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted noise were noise
 # What the prior of the noise exceeds in 2.5 % of cases: the scatter of a joint (rad, or m), and
-# the instrument's over the stated one.  Beyond them only repeats show that scatter is noise.
+# the instrument's over the stated one.  Beyond them only repeats show that scatter is noise, and
+# markers of one pose that it is the instrument's.
 UPPER = 1.96
 MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREAD, JOINT_SPREAD)))
 MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
@@ -236,7 +238,7 @@ class SupportedFloor:
             rounding = rounded_joints(dataset.table, dataset.base.model.chain.turning)
             excess = scatter_beyond(noise, rounding[0] if rounding else 0.0)
             smooth = np.maximum(smooth, excess)
-            above = max(noise.factor**2 - MOST_STATED**2, 0.0)
+            above = max(noise.factor**2 - max(MOST_STATED, self._of_single_readings()) ** 2, 0.0)
         stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
         moved = np.moveaxis(data.G * np.sqrt(smooth), 2, 0)
         self.joints = np.array([mean_square(data, g) for g in moved])
@@ -258,6 +260,18 @@ class SupportedFloor:
                 variance = shown + common
         self.noise, self.stands_out = min(float(np.sqrt(variance)), fitted), bool(excess.any())
         self.unexplained = float(np.sqrt(max(fitted**2 - self.noise**2, 0.0)))
+
+    def _of_single_readings(self) -> float:
+        """How many times the stated noise markers of one pose, or repeats, let the instrument have:
+        the upper end of what they show; 0 where they do not tell."""
+        (dataset, data, _), good = self.of, ~self.of[1].faulty
+        base, e = dataset.base, _left_over(data, self.at)[good].ravel()
+        assert base.stated is not None
+        some = subset(base.observed, good)
+        found = single_readings(some, e, base.stated[good], data.X.shape[2])
+        if found is None:
+            return 0.0
+        return found.ratio * float(np.sqrt(found.dof / special.chdtri(found.dof, 1 - BEYOND)))
 
     @property
     def told(self) -> NoiseFloor:

@@ -10,7 +10,13 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.diagnosis.baseline import NoisyData, Projection, project
+from elastocal.diagnosis.baseline import (
+    NoiseValues,
+    NoisyData,
+    Projection,
+    prior_deviations,
+    project,
+)
 from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer, held_by_prior
 from elastocal.diagnosis.diagnosis import (
     Candidate,
@@ -36,12 +42,14 @@ from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, times_of
 from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
+from elastocal.identification.mistakes import SURELY, TURN_ROUND
 from elastocal.identification.solve import FAR, far_off
 from elastocal.measurements import told_of_rounding
-from elastocal.messages import listed, rounded
+from elastocal.messages import gathered, listed, rounded
 from elastocal.model.effects.base import LinkFrame
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.geometry import KEYS, Backlash
+from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray
@@ -308,10 +316,13 @@ SUSPECT_SHARE = 0.05
 OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the reader is told
 
 
-def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
-    """Every hypothesis with its probability, in the slot where it is likeliest.  Last come those
-    that the data do not show at typical size and do not ask for: they have their prior alone."""
-    found = few.selected
+def candidates(
+    dataset: DiagnosisData, few: FewAnswer, told: Sequence[FoundEffect]
+) -> tuple[Candidate, ...]:
+    """Every hypothesis with its probability, in the slot where it is likeliest, of those `told`
+    what is told.  Last come those that the data do not show at typical size and do not ask for:
+    they have their prior alone."""
+    found, own = few.selected, {(f.effect, f.where): f.probability for f in told}
     best: dict[tuple[str, str], Candidate] = {}
     alone = zip(dataset.hypotheses, found.alone.distance.tolist(), strict=False)
     distance = {h.key: d for h, d in alone}
@@ -323,7 +334,7 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
             what = item.what
             if not isinstance(what, Hypothesis):
                 continue
-            key, p = what.key, named.get(id(what), float(p))
+            key, p = what.key, own.get(what.key, named.get(id(what), float(p)))
             row = Candidate(*key, what.stage, p, float(score), distance[key], settings_of(item))
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
@@ -381,10 +392,24 @@ def warnings(
             f"the load hardly turns {places}, approached from both sides"
         )
     if dataset.table.time is None:
-        yield (
-            "without times no drift can be seen, and a jump only by the order of the rows: "
-            "record time_s"
-        )
+        yield ("without times no drift can be seen, and a jump only by the order of the rows")
+
+
+def turned_loads(dataset: DiagnosisData, noise: NoiseValues) -> Iterator[str]:
+    """Where most compliances of the fitted model are surely negative, as `impossible_values`."""
+    base, fitted = dataset.base, dataset.fitted
+    of = {
+        p.name: j for j, p in enumerate(base.model.parameters) if p.effect == JointCompliance.name
+    }
+    k = [i for i, name in enumerate(fitted) if name in of and base.x[of[name]] < 0]
+    if 2 * len(k) <= len(of) or not dataset.table.force.any():
+        return
+    at = np.array([of[fitted[i]] for i in k])
+    deviation = np.linalg.norm(project(dataset.data, noise).beta_deviation[:, k], axis=0)
+    surely = at[base.x[at] < -SURELY * prior_deviations(base)[at] * deviation]
+    if 2 * len(surely) > len(of):
+        names = gathered(base.model.names[j] for j in surely)
+        yield f"{names} negative, which no spring is: do not use this model. {TURN_ROUND}"
 
 
 def unheard_of(found: Sequence[FoundEffect], model: Model) -> dict[str, tuple[str, float]]:

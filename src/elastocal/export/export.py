@@ -90,8 +90,9 @@ class Wish:
 class Exported:
     """What was written, and at which cost.
 
-    `held`: parameters that the data did not determine, with the values used; `by_prior`: those that
-    owe more to a prior; `refit`: how far the file is from the arm before and after what it holds
+    `held`: parameters that the data did not determine, with the values used; `undetermined`: those
+    of them in no sum that is known, which other poses would show; `by_prior`: those that owe more
+    to a prior; `refit`: how far the file is from the arm before and after what it holds
     was fitted to it; `correction`: where its joints are to be commanded besides, empty where
     nothing was asked for; `T_tracker_base` (4, 4) goes with what the file holds, which has a place
     for it where it is `framed`; `checked`: the largest distance in m when it was read back with
@@ -102,6 +103,7 @@ class Exported:
     format: str
     cost: exportable.Cost
     held: dict[str, float]
+    undetermined: tuple[str, ...]
     by_prior: tuple[str, ...]
     of_the_measurement: tuple[str, ...]
     refit: exportable.Refit | None
@@ -165,6 +167,10 @@ def export(
     each = zip(calibrated.model.parameters, calibrated.entries, strict=True)
     held = {p.name: plain(e.get("held")) for p, e in each
             if not p.shrunk and e.get("identifiable") is not True}  # fmt: skip
+    left, of = calibrated.left, dict(zip(calibrated.model.names, calibrated.entries, strict=True))
+    lost = set(left.names) if left else set[str]()
+    summed = {n for n, e in of.items() if n not in lost and e.get("combined_with")}
+    alone = [n for n in held if n not in summed.union(left.redundant if left else ())]
     spec, loads = calibrated.model.cell.model, len(cost.forces)
     fitted = refit is not None and refit.taken
     doubts = (
@@ -181,13 +187,13 @@ def export(
         (cost.unsettled, f"{cost.unsettled} of {cost.poses} random poses have no static "
          "equilibrium under the load and are left out"),
     )  # fmt: skip
-    told = [text for so, text in doubts if so]
+    told = [*calibrated.doubted, *(text for so, text in doubts if so)]
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
     made = getattr(_Writing(calibrated, wish, kept, pieces, cost, fitted), format)()
     warnings = (*told, *made.pop("warnings", ()))
     return Exported(
-        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
-        pieces.T_tracker_base, wish.base_frame, warnings, **made,
+        wish.kind, cost, held, tuple(alone), calibrated.by_prior, kept.of_the_measurement, refit,
+        correction, pieces.T_tracker_base, wish.base_frame, warnings, **made,
     )  # fmt: skip
 
 
@@ -252,6 +258,7 @@ class _Writing:
             "robot": chain.name,
             "cell": None if cell.path is None else Path(cell.path).name,
             "result": Path(self.calibrated.source).name,
+            "doubt": self.calibrated.doubt,
             "units": "SI: m, rad, N, kg",
             "parameters": [  # what an older result does not have is null
                 {"name": name} | {key: entry.get(key) for key in KEYS}
@@ -326,7 +333,7 @@ class _Writing:
             span = high if low == high else f"{low} to {high}"
             told += f", fitted where it was measured, under {span} N"
             told += f", {base_told(self.pieces.T_tracker_base)}"
-        return told
+        return "; ".join(filter(None, (told, self.calibrated.doubt)))
 
     def random(self, poses: int) -> Measurements:
         return random_table(self.kept.full.model, self.kept.conditions, poses, self.wish.seed)

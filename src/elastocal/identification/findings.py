@@ -21,7 +21,7 @@ from elastocal.identification.result import Calibration, Finding, made, more_pos
 from elastocal.identification.solve import Solution
 from elastocal.identification.start import FITS
 from elastocal.measurements import Measurements, numbered, told_of_rounding
-from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of
+from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of, together
 from elastocal.model.calibrated import MOSTLY, mostly_prior
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.units import display
@@ -430,10 +430,11 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
         )
         still = np.flatnonzero(np.ptp(result.observations.table.q, axis=0) == 0)
         if len(still) and not all(name.endswith(".compliance") for name in shown):
-            names = listed([str(j + 1) for j in still])
-            remedy = (
-                f"Joint {names} never moves in these data: move it, or check its column. {remedy}"
-            )
+            names, its = f"Joint {still[0] + 1} never moves", "move it, or check its column"
+            if len(still) > 1:
+                names = f"Joints {together([str(j + 1) for j in still])} never move"
+                its = "move them, or check their columns"
+            remedy = f"{names} in these data: {its}. {remedy}"
         yield _note("undetermined", remedy, parameters=n, names=shown)
 
 

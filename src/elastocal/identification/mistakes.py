@@ -660,6 +660,13 @@ def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
     ]
 
 
+TURN_ROUND = (
+    "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
+    "negative. Turn the sign round in the table if it is wrong (torque columns too), and identify "
+    "again."
+)
+
+
 def impossible_values(result: Calibration) -> Iterator[Finding]:
     """Where most compliances are among them, no missing effect explains it, but loads in the
     opposite direction do, and no load is compensated rightly."""
@@ -669,13 +676,8 @@ def impossible_values(result: Calibration) -> Iterator[Finding]:
     turned = [p for p, _ in found if p.effect == JointCompliance.name]
     signs = 2 * len(turned) > len(springs) and bool(result.observations.table.force.any())
     parameters, estimates = zip(*found, strict=True)
-    turn_round = (
-        "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
-        "negative. Turn the sign round in the table if it is wrong (torque columns too), and "
-        "identify again."
-    )
     yield (_poor if signs else _care)(
-        "impossible_values", turn_round if signs else AT_BOUND,
+        "impossible_values", TURN_ROUND if signs else AT_BOUND,
         parameters=tuple(p.name for p in parameters), values=tuple(e.held for e in estimates),
         units=tuple(p.unit for p in parameters),
         likely="the sign of the force columns" if signs else "",

@@ -567,6 +567,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
             tuple(map(_estimate_json, self.estimates)), self.left, lacking,
             prediction.measured_loads(read), self.shown, prediction.measured_visits(read),
             calibrated.mostly_prior(self.prior_share), self.scatter,
+            import_module(WORDS).doubt_of(self) if self.findings else "",
         )  # fmt: skip
 
     @cached_property
@@ -701,6 +702,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         chain, observed, off = self.model.chain, self.observations, self.unsteadiness
         tested = {} if self.test is None else self.test.to_json()
         said = import_module(WORDS).judgement(self).sentence if self.findings else None
+        against = {"sentence": said, "doubt": self.arm.doubt}
         return plain({
             "schema": SCHEMA,
             "robot": chain.name,
@@ -716,7 +718,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
             "heldout_kept_rms_um": microns(self.heldout_rms),
             **{f"{name}_um": microns(getattr(self, name)) for name in LENGTHS},
             **{f"test_{name}": tested.get(name) for name in ("rms_um", "mean_um", "max_um")},
-            "verdict": self.verdict.to_json() | {"sentence": said},
+            "verdict": self.verdict.to_json() | against,
             "predicted_new_poses_um": self.predicted,
             "load_point_um": microns(self.load_point_error),
             "measured_visits": self.arm.visits,

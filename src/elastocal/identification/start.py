@@ -499,6 +499,8 @@ def _check_units(model: Model, table: Measurements) -> None:
         cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
     elif ratio < 1 / EXTENT_FACTOR:
         cause = "the positions are probably metres in columns named …_mm: rename to …_m"
+        if model.observe == "deflection" and table.force.any(axis=1).all():
+            cause = "give positions with and without load: observe = 'deflection' subtracts them"
     else:
         return
     raise InputError(
@@ -637,8 +639,7 @@ def without_copies(table: Measurements) -> tuple[Measurements, tuple[str, ...]]:
     sentence for each."""
     if table.position is None or len(table.marker_names) < 2:
         return table, ()
-    points, told = _by_visit(table), []
-    copies: set[int] = set()
+    points, told, copies = _by_visit(table), [], set[int]()
     for a, b in combinations(range(len(table.marker_names)), 2):
         both = np.isfinite(points[:, [a, b], 0]).all(axis=1)
         if a in copies or both.sum() < FEWEST_VISITS:

@@ -165,6 +165,7 @@ class CalibratedArm(Valued, Saved):
         visits: The joints and forces measured; None in results that do not say.
         by_prior: Those of `determined` that owe more to a prior than to the readings.
         scatter: What configurations say of them, where no known noise explains the residual.
+        doubt: What identify says against its use; empty where nothing speaks against it.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -185,6 +186,7 @@ class CalibratedArm(Valued, Saved):
     visits: MeasuredVisits | None = field(default=None, compare=False)  # rounded in files
     by_prior: tuple[str, ...] = ()
     scatter: Scatter | None = None
+    doubt: str = field(default="", compare=False)
 
     def __repr__(self) -> str:
         return (
@@ -200,6 +202,11 @@ class CalibratedArm(Valued, Saved):
             return self.scatter.covariance, self.scatter.dof
         dof = {entry["name"]: float(entry.get("dof") or np.inf) for entry in self.entries}
         return self.covariance, np.array([dof.get(name, np.inf) for name in self.determined])
+
+    @property
+    def doubted(self) -> list[str]:
+        """The same with what it is said of, as a warning beside all that is made of the arm."""
+        return [f"{self.source}: {self.doubt}"] * bool(self.doubt)
 
     def untried(self, force: Array) -> str:
         """In words, where some of the loads (N, 3) are heavier than any measured (kept rounded)."""
@@ -312,6 +319,7 @@ def read_calibrated(
         stated.measured_poses,
         visits if visits is not None and len(visits.q) and visits.q.shape == shape else None,
         mostly_prior(stated.prior_share or {}), scatter,
+        str((stated.verdict or {}).get("doubt") or ""),
     )  # fmt: skip
 
 
@@ -347,6 +355,7 @@ class _Result(Table, extra="ignore"):
     measured_visits: MeasuredVisits | None = key("a table")
     prior_share: dict[str, float | None] | None = key("a table of shares")
     scatter: Scatter | None = key("a table")
+    verdict: dict[str, Any] | None = key("a table")
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:

@@ -432,9 +432,10 @@ def with_noise_of(cell: Cell, done: Calibration) -> tuple[Cell, tuple[str, ...]]
     if observed.kind != "distance":
         tracker = replace(cell.tracker, noise=CartesianNoise(np.full(3, sigma)))
         key, along = "sigma_um", " on each axis"
+    states = f"[tracker] states {'too small a' if done.noise.ratio_to_stated else 'no'} {key}"
     told = (
-        f"[tracker] states no {key}: the plan takes the {length(sigma)}{along} that the "
-        "measurements done show; state it where you know it"
+        f"{states}: the plan takes the {length(sigma)}{along} that the measurements done show; "
+        "state it where you know it"
     )
     return replace(cell, tracker=tracker), (told,)
 

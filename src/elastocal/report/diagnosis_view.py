@@ -51,7 +51,8 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     tone = say.TONES[d.findings[0].severity] if d.findings else "good"
     yield say.ShownVerdict(tone, diagnosis_headline(d))
     lines = [(label, say.capital(text)) for label, text in diagnosis_lines(d)]
-    lines += [("Not separable", say.capital(f"{text}.")) for text in alike(d)]
+    if d.groups or d.verdict != "ambiguous":  # which says it
+        lines += [("Not separable", say.capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
     yield say.Lines(
         [*lines, *((say.WARNING, say.sentence(printable(text))) for text in d.warnings)]
@@ -226,7 +227,7 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
             moved = f"{say.driver_name(curve.driver)} moves {say.driver_name(curve.entry)}"
             yield "Shape", f"{moved} by {curve_span(curve)} in all."
         open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
-        for f in d.effects if d.open else ():  # beside the open question, or its likeliest answer
+        for f in d.effects if d.verdict == "ambiguous" else ():
             text = f"{say.effect_at(f)} (probability {say.probability(f.probability)}"
             text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
             yield "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
@@ -286,19 +287,21 @@ def diagnosis_steps(d: Diagnosis) -> Iterator[str]:
     yield from (f.remedy for f in d.findings if f.remedy)
     if (extra := d.extra) is not None:
         rivals, n = say.together([say.name_of(name) for name in extra.rivals], "or"), extra.n_poses
-        if not extra.separable:
+        if not (extra.separable or extra.inseparable):
             yield f"No pose that this cell allows separates {rivals}."
-        else:
+        elif extra.separable:
             yield (
                 f"{say.counted(n, 'more pose')} to separate {rivals}: the probability of the right "
                 f"answer rises from {say.probability(extra.probability_before)} to "
                 f"{say.probability(extra.probability_after)} (as many random poses: "
                 f"{say.probability(extra.probability_random)})."
             )
-            for group in extra.inseparable:
-                names = say.together([say.name_of(name) for name in group])
-                yield f"{say.capital(names)} count as one."
-        yield from (say.sentence(printable(text)) for text in extra.advice)
+        # Longer names first: one may begin another.
+        plain = {name: say.name_of(name) for name in sorted(extra.rivals, key=len, reverse=True)}
+        for text in extra.advice:
+            for name, told in plain.items():
+                text = text.replace(name, told)
+            yield say.sentence(printable(text))
     # One piece of advice serves many effects.
     yield from dict.fromkeys(say.sentence(printable(u.advice)) for u in d.untested)
 

@@ -489,12 +489,14 @@ class Residuals:
         if len(shown) * n > MOST_JOINT_DOTS:
             shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
 
-        def panel(axes: Axes, j: int) -> None:
-            q, unit = _in_unit(kinds[j], self.observed.table.q[self.observed.lead, j])
+        def panel(axes: Axes, k: int, j: int) -> None:
+            q, unit = _in_unit(kinds[j], at[:, j])
             self._over(axes, q, shown, 1.3, "-")
-            axes.set(xlabel=f"joint {j + 1} in {unit}", ylabel="" if j % 2 else "residual in µm")
+            axes.set(xlabel=f"joint {j + 1} in {unit}", ylabel="" if k % 2 else "residual in µm")
 
-        panels = [partial(panel, j=j) for j in range(len(kinds))]
+        at = self.observed.table.q[self.observed.lead]
+        moved = np.flatnonzero(np.ptp(at, axis=0) > 0)
+        panels = [partial(panel, k=k, j=int(j)) for k, j in enumerate(moved)]
         caption = (
             "Over joint positions; lines are means of equally many readings with twice their "
             "standard error. A wave or slope is an effect that the model lacks."

@@ -22,16 +22,27 @@ from elastocal.report import blocks as say
 
 def judgement(result: Calibration, reasons: bool = True) -> say.ShownVerdict:
     """With all its `reasons`, or where there are several without: they are lines of their own."""
+    tone, several = result.verdict.tone, len(result.verdict.missing) > 1
+    if tone == "poor":
+        return say.ShownVerdict("poor", say.sentence(doubt_of(result)))
+    if tone == "care":
+        told = CARE if several and not reasons else doubt_of(result)
+        return say.ShownVerdict("warn", f"{say.sentence(told)} {_accuracy(result)}")
+    noise = " The residual is consistent with noise." * (result.finding(*COMPARED[1:]) is not None)
+    return say.ShownVerdict("good", f"This calibration can be used. {_accuracy(result)}{noise}")
+
+
+CARE = "use this calibration with care"
+
+
+def doubt_of(result: Calibration) -> str:
+    """What speaks against its use, without a point; empty where nothing does."""
     tone, doubts = result.verdict.tone, result.verdict.missing
     if tone == "poor":
         why = next(_doubt(f) for f in doubts if f.severity == "poor")
-        return say.ShownVerdict("poor", f"Do not use this calibration: {why}.")
-    if tone == "care":
-        told = f": {'; and '.join(map(_doubt, doubts))}" if reasons or len(doubts) == 1 else ""
-        text = f"Use this calibration with care{told}. {_accuracy(result)}"
-        return say.ShownVerdict("warn", text)
-    noise = " The residual is consistent with noise." * (result.finding(*COMPARED[1:]) is not None)
-    return say.ShownVerdict("good", f"This calibration can be used. {_accuracy(result)}{noise}")
+        return f"do not use this calibration: {why}"
+    told = f": {'; and '.join(map(_doubt, doubts))}" if doubts else ""
+    return f"{CARE}{told}" if tone == "care" else ""
 
 
 def reasons_of(result: Calibration) -> list[str]:

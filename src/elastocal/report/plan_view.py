@@ -419,6 +419,9 @@ def next_lines(found: NextPoses) -> Told:
         begun = say.length(before) if math.isfinite(before) else "an unknown error"
         return f"{begun} to {say.length(after)}"
 
+    fit = found.calibration
+    if fit is not None and (fit.verdict.tone == "poor" or found.verdict == "enough"):
+        yield from ((say.WARNING, say.sentence(printable(text))) for text in fit.arm.doubted)
     yield "Next", f"{verdicts[found.verdict]}."
     yield "Error now", f"{now}."
     gain, if_right = both(g.before, g.after), both(g.model_before, g.model_after)

@@ -53,7 +53,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         ("all parameters together", say.size_of(c.p)),
     ])])  # fmt: skip
     steps = [
-        "Use the new calibration (elastocal compensate, elastocal export).",
+        *["Use the new calibration (elastocal compensate, elastocal export)."] * (not c.new.doubt),
         ("Look for the cause at the joints and links named. " if c.changed else
          "Measure more poses to see which parameter has changed. ")
         + "A missing effect can look like a change if poses or loads differ (elastocal diagnose "
@@ -98,6 +98,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         *(("Not compared", printable(f"{some(names, 8)} ({why})."))
           for why, names in c.not_compared.items()),
         *(("Next", step) for step in steps),
+        *((say.WARNING, say.sentence(printable(t))) for a in (c.old, c.new) for t in a.doubted),
     ])  # fmt: skip
     yield say.Fold("", lambda: [_moves(c)], figures=("moved",))
     yield _change_table(c)
@@ -284,10 +285,13 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
         yield say.Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
-    if done.held:
+    if names := done.undetermined:
+        told = "Not determined by the data, at the values that identify predicts with"
+        yield say.Sentence(f"{told}: {some(map(printable, names), 8)}.")
+    if n := len(done.held) - len(done.undetermined):
         yield say.Sentence(
-            "Not determined by the data, at the values that the identification predicts with: "
-            f"{some(done.held, 8)}."
+            f"{say.counted(n, 'parameter')} without a value alone: known in combinations, or not "
+            "identifiable at any pose under these loads (expected)."
         )
     if done.by_prior:
         yield say.Sentence(f"Determined mostly by a prior: {some(done.by_prior, 8)}.")
