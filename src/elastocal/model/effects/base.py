@@ -145,7 +145,7 @@ class Arm:
 
     def input(self, name: str, size: int) -> ca.SX:
         """The row's value of a table quantity ("q", "force", "time", …), declared on first use."""
-        if name not in (*COLUMNS, "marker", "unmoved") and not name.startswith("level:"):
+        if name not in (*COLUMNS, "marker", "moment", "unmoved") and not name.startswith("level:"):
             raise ValueError(f"arm.input takes {listed(sorted(COLUMNS), 9)}; found {name!r}")
         if name not in self.inputs:
             self.inputs[name] = ca.SX.sym(name, size)
