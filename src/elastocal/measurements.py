@@ -184,7 +184,7 @@ class Measurements(Result):
         Examples:
             >>> data = ec.Model("cell.toml").read("data.csv")
             >>> data.take(data.marker == 0)
-            <Measurements data.csv: 180 rows, 15 configurations, markers M1, M2, M3>
+            <Measurements data.csv: 180 rows, 15 configurations, markers M1>
         """
         try:
             one = np.ndim(np.arange(len(self))[index]) != 1

@@ -16,13 +16,6 @@ from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from elastocal.model.evaluate import VARIABLE, chosen_backend
 
 
-def test_an_option_without_effect_is_taken_and_not_offered() -> None:
-    assert "--jobs" not in run("identify", "--help").stdout
-    assert "--jobs" in run("design", "--help").stdout
-    done = run("identify", "no.toml", "no.csv", "--jobs", "2")
-    assert done.exit_code == 2 and "no.toml: no such file" in done.stderr
-
-
 def test_the_backend_is_what_models_use_and_what_results_state(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -61,14 +54,6 @@ def test_a_cell_file_in_anothers_place_is_told_so(words: str, tmp_path, monkeypa
     assert done.exit_code == 2 and not done.stdout
     assert f"elastocal: {first}: ends in {ending}, where the cell file" in done.stderr
     assert "the cell file (.toml) comes first" in " ".join(done.stderr.split())
-
-
-def test_a_second_cell_file_is_no_table_and_no_result(tmp_path, monkeypatch) -> None:
-    monkeypatch.chdir(Path(__file__).parents[1] / "golden" / "inputs" / "campaign")
-    for words in ("identify placed.toml placed.toml", "simulate placed.toml placed.toml -o",
-                  "compensate placed.toml placed.toml targets.csv -o"):  # fmt: skip
-        told = run(*words.replace("-o", f"-o {tmp_path}/out.csv").split())
-        assert told.exit_code == 2 and "ends in .toml, where the" in told.stderr
 
 
 def test_a_first_cell_that_cannot_be_read_is_not_left_behind(

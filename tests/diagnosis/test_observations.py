@@ -51,9 +51,8 @@ def test_positions_without_load_time_approach_and_further_markers() -> None:
     d = ec.diagnose(Model.assembled(kr270_chain(), plain), bare)
     assert d.n_readings == d.n_configurations == 24
     advice = {u.effect: u.advice for u in reversed(d.untested)}
-    assert {"joint_drift", "payload_error"} <= advice.keys()
+    assert "time_s" in advice["joint_drift"] and "payload_error" in advice
     assert "approach" in advice["hysteresis"] and "position_m" in advice["tracker_distortion"]
-    assert any("record time_s" in text for text in d.warnings)
     # The arm's sag is missing too here: whatever the answer, it is not that all is well.
     assert d.verdict != "nothing_significant"
 

@@ -46,8 +46,9 @@ def test_noise_of_poses_is_nothing() -> None:
 
 def test_a_gap_of_twelve_times_the_noise_is_not_nothing() -> None:
     """A joint jumped, and no effect that jumps is in the catalogue; errors add up."""
-    why = diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
-    gap = why.gap
+    gap = (
+        why := diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
+    ).gap
     assert why.verdict == "unknown_effect" and why.probability_nothing < 0.02
     left = (gap.explained**2 - gap.noise_floor**2) ** 0.5
     assert max(5 * gap.noise_floor, 0.5 * left) < gap.unexplained < 1.05 * left
@@ -75,8 +76,7 @@ def test_a_jump_is_found_by_the_rows_or_by_times_of_readings(night, tmp_path: Pa
     assert (why.verdict, jump.effect, jump.where) == ("explained", "encoder_jump", "joint3")
     assert jump.gap_reduction_ci95[0] > 0.6
     if night is None:
-        assert 98 < jump.settings["jump_time_s"] < 101
-        assert why.model_keys == {"clock": "rows"}
+        assert 98 < jump.settings["jump_time_s"] < 101 and why.model_keys == {"clock": "rows"}
         why.save(tmp_path / "found.toml")
         fit = ec.identify(tmp_path / "found.toml", table, test=late)
         assert fit.test is not None and fit.test.rms < 1.2 * fit.heldout_rms
