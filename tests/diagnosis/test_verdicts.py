@@ -28,8 +28,7 @@ def diagnosed(case: str, **options: Any) -> Diagnosis:
 
 @pytest.mark.long
 def test_what_imitates_a_withheld_effect_of_many_is_not_sure() -> None:
-    """An arm with errors at every joint, its weights taken out of the catalogue: what stands in
-    for them leaves more than the noise, and is no name above 0.9."""
+    """What stands in for an arm's weights leaves more than the noise, and is no name above 0.9."""
     whole = Path(__file__).parents[1] / "golden" / "inputs" / "whole"
     weights = ("link_mass_error", "gravity_sag", "link_weights")
     why = ec.diagnose(whole / "cell.toml", whole / "data.csv", without=weights)
@@ -46,9 +45,8 @@ def test_noise_of_poses_is_nothing() -> None:
 
 def test_a_gap_of_twelve_times_the_noise_is_not_nothing() -> None:
     """A joint jumped, and no effect that jumps is in the catalogue; errors add up."""
-    gap = (
-        why := diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
-    ).gap
+    why = diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
+    gap = why.gap
     assert why.verdict == "unknown_effect" and why.probability_nothing < 0.02
     left = (gap.explained**2 - gap.noise_floor**2) ** 0.5
     assert max(5 * gap.noise_floor, 0.5 * left) < gap.unexplained < 1.05 * left
