@@ -532,7 +532,10 @@ def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:
     # Where instrument and weight draw each marker, in the flange frame.
     R = base.model.flange_poses(table, base.x)[:, :3, :3]
     line = -offset / np.linalg.norm(offset, axis=1, keepdims=True)
-    for name, way in (("angle of view", line), ("weight's direction", -np.eye(3)[[2] * n])):
+    for name, way in (
+        ("angle of view", line),
+        ("weight's direction", np.tile([0.0, 0.0, -1.0], (n, 1))),
+    ):
         along = monomials(np.einsum("nij,ni->nj", R, way)) * MOTION
         for marker in cell.tool.markers:
             place = f"marker:{marker}"

@@ -271,13 +271,17 @@ def plan_extra(
         picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
         before, after = (share * expected(tasks, some) for some in ((), chosen))
         by_chance = share * float(np.mean([expected(tasks, pick) for pick in picks]))
-    inseparable = tuple(names for c in tasks for names in c.inseparable)
-    rivals = tuple(dict.fromkeys(name for s in sets for name in s.names))
-    pairs = tuple(pair for c in tasks for pair in c.pairs(chosen))
-    plan = measuring_order(pool, chosen, base.observed.table) if chosen else None
-    told = (none,) if none else tuple(advice)
     return ExtraPlan(
-        bool(chosen), inseparable, len(chosen), rivals, pairs, plan, before, after, by_chance, told
+        separable=bool(chosen),
+        inseparable=tuple(names for c in tasks for names in c.inseparable),
+        n_poses=len(chosen),
+        rivals=tuple(dict.fromkeys(name for s in sets for name in s.names)),
+        pairs=tuple(pair for c in tasks for pair in c.pairs(chosen)),
+        plan=measuring_order(pool, chosen, base.observed.table) if chosen else None,
+        probability_before=before,
+        probability_after=after,
+        probability_random=by_chance,
+        advice=(none,) if none else tuple(advice),
     )
 
 

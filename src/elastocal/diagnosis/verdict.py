@@ -392,7 +392,7 @@ def warnings(
             f"the load hardly turns {places}, approached from both sides"
         )
     if dataset.table.time is None:
-        yield ("without times no drift can be seen, and a jump only by the order of the rows")
+        yield "without times no drift can be seen, and a jump only by the order of the rows"
 
 
 def turned_loads(dataset: DiagnosisData, noise: NoiseValues) -> Iterator[str]:
