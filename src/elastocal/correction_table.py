@@ -33,8 +33,8 @@ NOMINAL_MISS = 1e-5  # m
 
 @dataclass(frozen=True)
 class CorrectionGrid:
-    """Levels of joints (rad or m), or of x, y, z (m, base frame) and a `rotation` (3, 3) or
-    None."""
+    """Levels of each joint (rad or m), or of x, y, z (m, base frame) with one `rotation` (3, 3) of
+    the tool, None for any."""
 
     axes: tuple[Array, ...]
     joints: bool
@@ -150,7 +150,8 @@ def _mostly_inexact(
     arm: CalibratedArm, grid: CorrectionGrid, status: tuple[str, ...], point: ToolPoint,
     force: Array | None, seed: int,
 ) -> str:  # fmt: skip
-    """Some points are tried again away from the limits, then with one joint moved: what helps?"""
+    """Some of the points are tried again away from the joint limits, and then with one joint moved,
+    to see what helps."""
     told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: for most others "
     chain, beyond = arm.model.chain, "the command is out of the joint limits"
     if grid.joints:

@@ -202,7 +202,7 @@ class Measurements(Result):
         """The table of a session that is not the one fitted: how the arm came to the first visit of
         that, where `direction` is 0, is of no other one."""
         side = self.direction
-        return self if side is None else replace(self, direction=np.where(side == 0, 1e-12, side))
+        return self if side is None else replace(self, direction=np.where(side == 0, NEITHER, side))
 
     __getitem__ = take  # data[data.marker == 0], data[:90]
     __iter__ = None  # rows have no form of their own
@@ -345,6 +345,7 @@ def with_moves(table: Measurements) -> Measurements:
 
 
 NEVER_YET = 1e15  # as the line of a table: after all that were measured
+NEITHER = 1e-12  # the side that a joint came from where no move of it is known; 0 is a first visit
 
 
 def by_rows(table: Measurements) -> Array:

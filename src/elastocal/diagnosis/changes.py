@@ -426,9 +426,9 @@ def _tested(
     old: CalibratedArm, new: CalibratedArm, names: list[str], functions: dict[str, str], z: Array,
     spread: Array, level: float, B: Array,
 ) -> tuple[tuple[ParameterChange, ...], float]:  # fmt: skip
-    """Each parameter and smooth function by Holm's rule, and p of all together.  `functions`:
-    parameter → that which it is part of; `spread`: N and V of z; `B` (poses, 3, p) in m per
-    unit."""
+    """Each parameter and each smooth function by Holm's rule, and p of all together.  `functions`:
+    parameter → that which it is part of; `spread`: N and V (2, p, p) of z; `B` (poses, 3, p) in m
+    per unit at the tool."""
     N, V = spread
     std = np.sqrt(np.diag(V))
     (v1, dof1), (v2, dof2) = (_variances(arm, names) for arm in (old, new))

@@ -570,8 +570,8 @@ class OrderPosterior:
         self.grams, self.scatter = grams_of[likeliest], tried[likeliest]
 
     def odds_near(self, order: float, m: int | None = None) -> float:
-        """Log odds of a family at this order, as far as data resolve it; of m lines, or any
-        number."""
+        """Log odds of a family at this order, as far as these data resolve it, against none; of m
+        lines, or of any number."""
         return self._odds(self._near(order, m))
 
     def _near(self, order: float, m: int | None = None) -> BoolArray:

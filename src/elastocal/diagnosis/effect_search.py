@@ -324,8 +324,8 @@ class Slot:
     scores: Array
 
     def best_of(self, other: Slot) -> Slot:
-        """The higher score of each: both bound what it would be under the noise that suits it
-        best."""
+        """The higher score of each: both bound from below what it would be under the noise that
+        suits it best."""
         each = zip(self.items, other.items, other.scores > self.scores, strict=True)
         items = tuple(b if up else a for a, b, up in each)
         return Slot(items, np.maximum(self.scores, other.scores))
@@ -551,8 +551,8 @@ class ForwardSelection:
         return best, Slot(slot.items, scores)
 
     def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
-        """The set with each of the items more, its noise and settings fitted; kept to be asked
-        again."""
+        """The set with each of the items more, its noise and settings fitted; kept, since they are
+        asked for again."""
         dataset = self.dataset
         sets = [(*current.items, item) for item in added]
         keys = [tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in s) for s in sets]

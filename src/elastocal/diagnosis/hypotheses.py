@@ -149,7 +149,7 @@ def possible(
     smooth ones, which have their own searches."""
     chain, cell = model.chain, model.cell
     active = {(p.effect, p.where) for p in model.parameters}
-    unread = {f"marker:{n}" for n in table.marker_names if n not in table.markers_read}
+    unread = {f"marker:{n}" for n in set(table.marker_names).difference(table.markers_read)}
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():
@@ -315,23 +315,23 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements, moments: Moments) -> S
 def _axis(setting: Setting, where: str, visits: Measurements, moments: Moments) -> SettingsGrid:
     if setting.kind == "order":
         return _orders(setting, where, visits)
+    prior = None  # of the moments alone; of all else any value is as probable
     if setting.kind == "range":
         values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
     elif setting.kind == "change_time":
-        values, log_prior = moments
+        values, prior = moments
         if len(values) > CHANGE_TIMES:  # as many between any two by their prior
-            sum_to = np.cumsum(np.exp(log_prior))
+            sum_to = np.cumsum(np.exp(prior))
             at = np.linspace(sum_to[0], sum_to[-1], CHANGE_TIMES)
             k = np.unique(np.interp(at, sum_to, np.arange(len(values))).round().astype(int))
-            values, log_prior = values[k], log_prior[k] - logsumexp(log_prior[k])
+            values, prior = values[k], prior[k] - logsumexp(prior[k])
     else:
         span = float(np.ptp(times_of(visits)))
         low, high = max(span / 20, setting.lower), min(3 * span, setting.upper)
         values = np.geomspace(min(low, high), high, TIME_CONSTANTS)
     step = np.gradient(values) if len(values) > 1 else np.ones(1)
-    if setting.kind != "change_time":
-        log_prior = np.full(len(values), -np.log(len(values)))
-    return SettingsGrid(values[:, None], log_prior, step[:, None])
+    alike = np.full(len(values), -np.log(len(values)))
+    return SettingsGrid(values[:, None], alike if prior is None else prior, step[:, None])
 
 
 def times_of(visits: Measurements) -> Array:

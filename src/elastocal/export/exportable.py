@@ -343,7 +343,8 @@ class JointCorrection:
     curves: Mapping[tuple[int, str], tuple[Array, Array]] = field(default_factory=dict)
 
     def __call__(self, q: ArrayLike, approach: ArrayLike | None = None) -> NDArray:
-        """Joints to command (joints,) or (n, joints); without `approach`, like q, no such curve."""
+        """Joints to command (joints,) or (n, joints); without `approach`, like q, no curve that
+        follows it counts."""
         given = np.asarray(q, dtype=float)
         sides = np.zeros_like(given) if approach is None else np.asarray(approach, dtype=float)
         found = given.copy()

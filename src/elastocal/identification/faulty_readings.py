@@ -414,12 +414,13 @@ def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, .
 CONVERT = "Measure common points from each station to convert them, or give each part by itself"
 
 
-def in_one_frame(model: Model, table: Measurements) -> tuple[str, Measurements] | None:
+def in_one_frame(
+    model: Model, table: Measurements, visit: IntArray
+) -> tuple[str, Measurements] | None:
     """The table with runs of rows that fit the nominal arm each in a frame of its own brought into
     that of the first, after words that say so, {} being what it then fits to; None where there are
-    no such runs.  `table` has positions."""
+    no such runs.  `table` has positions; `visit` (n,) counts them in its order."""
     flange, position = model.rigid.flange_poses(table), np.array(table.position)
-    visit = np.cumsum(np.r_[True, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
     starts, of = [0], list[Registration]()
     while (first := starts[-1]) < len(table):
         end = int(np.searchsorted(visit, visit[first] + FEWEST_POSES))

@@ -411,7 +411,7 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
     visits, rows = int(visit[-1]) + 1, np.arange(len(table))
     if visits < BLOCK or len(table) > MOST_ROWS:
         return
-    if moved_on := in_one_frame(model, table):
+    if moved_on := in_one_frame(model, table, visit):
         yield moved_on
     most = FARTHEST_ROW * max(round(len(table) / visits), 1)
     shifts, flange = np.arange(-most, most + 1), nominal_flanges(model.chain, table.q)

@@ -149,8 +149,8 @@ class NoisyReadings:
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
 
     def start(self, like: Fitted | None = None) -> Array:
-        """Variances (K,) of `like` where it has them; else by the residuals, shared ones a
-        tenth."""
+        """Variances (K,) of `like` where it has them; else own ones from the residuals, and shared
+        ones a tenth of these."""
         sets, size, e2 = self.sets, self.readings.size, (self.sets.e**2).mean(axis=1)
         # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
         unit = np.trace(self.structure.matrix.sum(axis=1), axis1=1, axis2=2)[sets.first] / size
@@ -420,7 +420,8 @@ def _chosen(readings: Readings, T: Array) -> NoiseFit:
 
 
 def supported(readings: Readings) -> list[str]:
-    """Structures whose variances the table can tell; what is stated until something is better."""
+    """Structures whose variances the table can tell.  What is stated is believed until something
+    else is better."""
     names = [name for name, model in STRUCTURES.items() if model.supports(readings)]
     return sorted(names, key=lambda name: name != "stated")
 

@@ -221,7 +221,8 @@ def more_poses() -> str:
 
 
 def remedies() -> dict[str, str]:
-    """What to do about findings of a kind, options named as messages do; of others it depends."""
+    """What to do about findings of a kind, options named as messages do now; of others it depends
+    on more."""
     return {
         "autocorrelated": "Visit poses and loads in random order and return to a reference pose "
         "every ten poses: residuals of visits that follow each other are alike, as where something "
@@ -575,7 +576,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """Rms in m to which the load point is known at new poses, where that is more than the
         verdict says of the markers: nothing measured tells where it lies among them.
 
-        It is the default point of `compensate`.  None where known as well, unstated, or deflected.
+        It is the default point of `compensate`.  None where it is known as well, or not stated,
+        and of deflections.
         """
         cell, at, read = self.model.cell, self.verdict.at, self.observations
         if not cell.tool.load_point.any() or at is None or cell.model.observe == "deflection":

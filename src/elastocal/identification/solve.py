@@ -515,7 +515,8 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     root = drawing_root(covariance)
     # Of many readings some tell it as well: it is no smaller where there are more of them.
     looked = problem.sample(BENT_SAMPLE)
-    residual, B = found.residual[looked.rows], looked.regressor(found.x, kept).B * size
+    B = looked.regressor(found.x, kept).B if problem.large else found.B[looked.rows]
+    residual, B = found.residual[looked.rows], B * size
     rng, steps = np.random.default_rng(0), np.zeros((BENDS, len(found.x)))
     steps[:, dropped] = delta = typical * rng.standard_normal((BENDS, len(dropped)))
     steps[:, kept] = rng.standard_normal((BENDS, len(kept))) @ root.T - delta @ chosen.mixing.T
