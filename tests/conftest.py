@@ -44,8 +44,7 @@ def short_search(request: pytest.FixtureRequest) -> Iterator[None]:
     if WHOLE & {*request.path.parts} or getattr(request.module, "WHOLE_SEARCH", False):
         yield
         return
-    names = ("execution", "search")
-    drift, search = (import_module(f"elastocal.planning.{name}") for name in names)
+    drift, search = (import_module(f"elastocal.planning.{n}") for n in ("execution", "search"))
     with pytest.MonkeyPatch.context() as patch:
         quick = replace(search.EFFORTS["quick"], starts=1)
         patch.setitem(search.EFFORTS, "quick", quick)

@@ -19,6 +19,7 @@ from support.design_commands import (
 
 from elastocal.planning import search
 
+WHOLE_SEARCH = True  # as in the process that is stopped
 GOING_ON = "resuming the interrupted design"
 
 
