@@ -164,6 +164,8 @@ def check_output(path: str | Path, endings: Collection[str] = ()) -> None:
     """Raise InputError where no file can be written under `path`, or its ending is that of
     something else; a name without one may stand for anything."""
     _check_path(path)
+    told = f"{path} reads like an option; name the file to write (./{path} if it is called so)"
+    require(not str(path).startswith("-"), told)
     folder, ending = Path(path).absolute().parent, Path(path).suffix.lower()
     require(not os.path.isdir(path), f"{path} is a directory; name a file to write")
     if not _is_device(path):

@@ -519,14 +519,19 @@ class Roadmap:
         return csgraph.shortest_path(self._graph, method="FW", return_predecessors=True)
 
     def parts(self, needed: list[int]) -> list[list[int]]:
-        """`needed` points by what free moves connect, the largest part first.  Only as many moves
-        are checked as it takes: those of the shortest trees among `needed`, then through all
-        points, until all of one are free."""
+        """`needed` points by what free moves connect, the largest part first.  Checked are those
+        of the shortest trees among `needed`, then through all points, and where some are blocked
+        ever more of the shortest between what is joined so far."""
         for among in (np.array(needed), np.arange(len(self.points))):
-            free = False
-            while not free:
-                tree = csgraph.minimum_spanning_tree(self._graph[np.ix_(among, among)])
-                free = self.check(among[np.transpose(tree.nonzero())].tolist())
+            within, more = np.ix_(among, among), 1
+            tree = csgraph.minimum_spanning_tree(self._graph[within])
+            while not self.check(among[np.transpose(tree.nonzero())].tolist()):
+                joined = self.checked[within] & np.isfinite(self.direct[within])
+                part = csgraph.connected_components(joined, False)[1]
+                open_ = np.triu((part[:, None] != part) & ~self.checked[within])
+                near = np.argsort(self.times[within][open_], kind="stable")[:more]
+                self.check(among[np.argwhere(open_)[near]].tolist())
+                tree, more = csgraph.minimum_spanning_tree(self._graph[within]), 2 * more
             label = dict(zip(among, csgraph.connected_components(tree, False)[1], strict=True))
             names = dict.fromkeys(label[point] for point in needed)
             found = [[point for point in needed if label[point] == name] for name in names]
