@@ -12,7 +12,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from scipy import sparse
+from scipy import linalg, sparse
 
 from elastocal.identification.faulty_readings import FaultyGroup, OutlierReport, report_faulty
 from elastocal.identification.findings import KNOWN_NOISE, judged, warning_sentences
@@ -21,6 +21,7 @@ from elastocal.identification.least_squares import (
     Covariance,
     Rows,
     clustered,
+    drawn_by_each,
     held_out_residual,
     rms_3d,
     told_by_one,
@@ -268,6 +269,7 @@ def summarise(
     faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage, _ = solution.crossed
+    shown, held_out_told = _held_out(solution, covariance)
     there = np.isfinite(heldout)  # under a drift one that is not would reach all
     plainly_large = problem.large and solution.held is None
     report, stated = None, found.contradicted
@@ -280,6 +282,7 @@ def summarise(
         determined=determined, spread=found.spread,
         correlations=tuple(sorted(pairs, key=lambda pair: -abs(pair[2]))),
         observations=observed, residual=final.residual, held_out=heldout, sigma=sigma,
+        held_out_told=held_out_told,
         dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
         heldout_rms=rms_3d(heldout, observed.size), nominal_rms=solution.nominal_rms,
         converged=final.converged, reason=final.reason, outliers=() if set_apart else faulty,
@@ -291,7 +294,7 @@ def summarise(
         ),
         faulty_report=report, active=found.active, prior_share=found.prior_share,
         smooth=found.smooth, left=left_open(own_sizes, found.limits), copies=copies,
-        shown=_shown(solution, covariance),
+        shown=shown,
         findings=(made("care", "knowledge_contradicted", **stated),) if stated else (),
     )  # fmt: skip
     predicted = predicted_error(
@@ -346,12 +349,34 @@ def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatt
     return Scatter(found.matrix, found.dof) if found.dof.all() else None
 
 
-def _shown(solution: Solution, covariance: Array) -> ShownPoses | None:
-    observed, left = solution.problem.observations, solution.crossed[2]
-    if solution.problem.large or not np.isfinite(covariance).all() or not left.all():
-        return None
-    std = uncertainty_of(observed, solution.fit.B, covariance, left)
-    return ShownPoses(float(std.max()), len(std))
+def _held_out(
+    solution: Solution, covariance: Array
+) -> tuple[ShownPoses | None, tuple[float, float]]:
+    """How sure the fit is where it was measured, where the others tell each configuration; the mean
+    square in m² that this has in the errors held out; and the degrees of freedom ν of the mean
+    square T of these, whose variance is 2T²/ν as configurations show it."""
+    fit, observed, (held, _, left) = solution.fit, solution.problem.observations, solution.crossed
+    weights, labels = solution.problem.weights, observed.configuration
+    labels = labels if weights.together is None else weights.together
+    counted = np.isfinite(held) & (np.arange(len(held)) % observed.size < 3)
+    held, rows = np.where(counted, held, 0.0), np.repeat(labels, observed.size)
+    _, code = np.unique(rows, return_inverse=True)
+    square, count = np.bincount(code, held**2), np.bincount(code, counted)
+    off, told = square - square.sum() / max(count.sum(), 1) * count, count > 0
+    shown, own = None, 0.0
+    if not solution.problem.large and np.isfinite(covariance).all():
+        Q, R = linalg.qr(weights.apply(fit.B), mode="economic")
+        seen = linalg.solve_triangular(R, fit.B.T, trans="T").T
+        off += drawn_by_each(seen, Q, fit.whitened, held, rows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            std = uncertainty_of(observed, fit.B, covariance, left)
+        known = std[np.isfinite(std)]
+        own = float(np.mean(known**2)) if len(known) else 0.0
+        shown = ShownPoses(float(std.max()), len(std)) if len(known) == len(std) else None
+    n = int(told.sum())
+    spread = float((off[told] ** 2).sum()) * n / max(n - 1, 1)
+    dof = 2 * square.sum() ** 2 / spread if n > 1 and spread > 0 else 0.0
+    return shown, (own, float(dof))
 
 
 def _estimates(

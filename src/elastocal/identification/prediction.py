@@ -27,8 +27,8 @@ from scipy import special
 from elastocal.above import ByValue
 from elastocal.cell import Cell
 from elastocal.engine import least_norm
-from elastocal.identification.least_squares import Covariance, drawing_root, rms_3d, variance_of
-from elastocal.identification.noise_summary import Noise
+from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
+from elastocal.identification.noise_summary import BEYOND, Noise
 from elastocal.identification.solve import Solution, deviates, reduce
 from elastocal.measurements import Measurements
 from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
@@ -403,36 +403,40 @@ class Excess:
 
 
 def excess_of(
-    observed: Observations, residual: Array, dof: int, noise: Noise, rng: np.random.Generator
+    residual: tuple[float, float],
+    left_out: tuple[float, float],
+    own: float,
+    noise: Noise,
+    rng: np.random.Generator,
 ) -> Excess | None:
-    """From repeats where there are enough, else from the stated noise; None without either.  Mean
-    squares are drawn as s² ν/χ²_ν.  Between configurations it is σ² + n τ² with n readings in a
-    cell of configuration, marker and load; within them σ²."""
-    rows, spent = len(residual), len(residual) / max(dof, 1)
-    scatter = rms_3d(residual, observed.size) ** 2 * spent
-    test = noise.lack_of_fit
-    one = np.ones(DRAWS)
+    """From repeats where there are enough, else from the stated noise; None without either.
+    `residual` and `left_out` are mean squares in m² with their degrees of freedom: that of the
+    residuals, and that of errors held out, of which the uncertainty of the fits has `own`.
+
+    Where the residuals show that more than noise is left, which the fit followed at its own
+    configurations, τ² = T − σ² − own of the errors T held out, for which the others are new poses.
+    Mean squares are drawn as s² ν/χ²_ν."""
+    test, single, inflated, pure = noise.lack_of_fit, noise.single, np.ones(DRAWS), np.ones(DRAWS)
+    scatter, dof = residual
     if test is not None and test.dof_pure >= FEWEST_REPEATS:
-        n = rows / (rows - test.dof_pure)
-        pure = scatter * dof / (test.dof_between * test.F + test.dof_pure)
-        between = test.F * _chi2(test.dof_between, rng)
         within = _chi2(test.dof_pure, rng)
-        beyond = np.maximum(between - within, 0.0)
-        visits = any(s.part for s in noise.sizes or ())
-        return Excess(beyond / n * pure, one if visits else 1 + beyond / within)
-    single = noise.single
-    if noise.ratio_to_stated and single is not None and single.above:
-        # The noise is what single readings say, and the rest of the residual beyond it.
-        pure, own = scatter * (single.ratio / noise.ratio_to_stated) ** 2, max(dof - single.dof, 1)
-        between = max(dof * scatter - single.dof * pure, 0.0) / own * _chi2(own, rng)
-        return Excess(np.maximum(between - pure * _chi2(single.dof, rng), 0.0), one)
-    if noise.ratio_to_stated:
-        floor = scatter / noise.ratio_to_stated**2
-        return Excess(floor * np.maximum(noise.ratio_to_stated**2 * _chi2(dof, rng) - 1, 0.0), one)
-    return None
+        if not any(s.part for s in noise.sizes or ()):
+            inflated = np.maximum(test.F * _chi2(test.dof_between, rng) / within, 1.0)
+        pure = scatter * dof / (test.dof_between * test.F + test.dof_pure) * within
+    elif noise.ratio_to_stated:
+        if single is not None and single.above:
+            # The noise is what single readings say, and the rest of the residual beyond it.
+            pure = single.ratio**2 * _chi2(single.dof, rng)
+        pure = scatter / noise.ratio_to_stated**2 * pure
+    else:
+        return None
+    beyond = scatter * _chi2(dof, rng) - pure
+    if left_out[1] > 0 and np.mean(beyond <= 0) < BEYOND:
+        beyond = left_out[0] * _chi2(left_out[1], rng) - pure - own * inflated
+    return Excess(np.maximum(beyond, 0.0), inflated)
 
 
-def _chi2(dof: int, rng: np.random.Generator) -> Array:
+def _chi2(dof: float, rng: np.random.Generator) -> Array:
     """Draws (DRAWS,) of ν/χ²_ν: by what factor a mean square may be off."""
     dof = max(dof, 1)
     return np.asarray(dof / rng.chisquare(dof, DRAWS))

@@ -314,6 +314,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         observations: The readings that were fitted, as observations.
         residual: (rows,), observed minus predicted, in m (rad).
         held_out: The same with each configuration predicted by a fit to the others.
+        held_out_told: Mean square in m² that the uncertainty of those fits has in it, and degrees
+            of freedom of its own, 0 where none could be held out.
         sigma: Standard deviation of the residual per whitened row (in m with unit weights).
         dof: Its degrees of freedom.
         residual_rms: 3-D rms of `residual`, in m.
@@ -361,6 +363,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     spread: Covariance
     correlations: tuple[tuple[str, str, float], ...]
     sigma: float
+    held_out_told: tuple[float, float]
     heldout_rms: float
     nominal_rms: float
     converged: bool
@@ -597,7 +600,12 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     def excess(self) -> prediction.Excess | None:
         """By how much configurations scatter beyond their noise; None where nothing tells it."""
         rng = np.random.default_rng(0)
-        return prediction.excess_of(self.observations, self.residual, self.dof, self.noise, rng)
+        scatter = self.residual_rms**2 * len(self.residual) / max(self.dof, 1), self.dof
+        own, dof = self.held_out_told
+        each = self.held_out.reshape(-1, self.observations.size)[:, :3]
+        told = each[np.isfinite(each).all(axis=1)]
+        left_out = float((told**2).sum() / len(told)) if dof else 0.0
+        return prediction.excess_of(scatter, (left_out, dof), own, self.noise, rng)
 
     @checked_arguments
     def position(
