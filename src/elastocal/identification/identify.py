@@ -365,14 +365,15 @@ def _held_out(
     off, told = square - square.sum() / max(count.sum(), 1) * count, count > 0
     shown, own = None, 0.0
     if not solution.problem.large and np.isfinite(covariance).all():
-        Q, R = linalg.qr(weights.apply(fit.B), mode="economic")
-        seen = linalg.solve_triangular(R, fit.B.T, trans="T").T
-        off += drawn_by_each(seen, Q, fit.whitened, held, rows)
         with np.errstate(divide="ignore", invalid="ignore"):
             std = uncertainty_of(observed, fit.B, covariance, left)
         known = std[np.isfinite(std)]
         own = float(np.mean(known**2)) if len(known) else 0.0
         shown = ShownPoses(float(std.max()), len(std)) if len(known) == len(std) else None
+    if not solution.problem.large and solution.held is None:
+        Q, R = linalg.qr(weights.apply(fit.B), mode="economic")
+        seen = linalg.solve_triangular(R, fit.B.T, trans="T").T
+        off += drawn_by_each(seen, Q, fit.whitened, held, rows)
     n = int(told.sum())
     spread = float((off[told] ** 2).sum()) * n / max(n - 1, 1)
     dof = 2 * square.sum() ** 2 / spread if n > 1 and spread > 0 else 0.0

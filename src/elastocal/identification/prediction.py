@@ -392,10 +392,12 @@ class PredictedError:
 class Excess:
     """By how much configurations scatter beyond their noise, as draws (DRAWS,) of what the data
     leave possible: `squared` in m², 3-D, and the factor `inflated` on the covariance of the
-    estimates, which the missing part has moved as well."""
+    estimates, which the missing part has moved as well; `fitted` is the mean square of it that
+    residuals have."""
 
     squared: Array
     inflated: Array
+    fitted: float = 0.0
 
     def with_chance(self, chance: float, rng: np.random.Generator) -> Excess:
         there = rng.random(DRAWS) < chance
@@ -403,40 +405,45 @@ class Excess:
 
 
 def excess_of(
-    residual: tuple[float, float],
-    left_out: tuple[float, float],
-    own: float,
-    noise: Noise,
+    residual: tuple[float, int, int], left_out: tuple[float, float], own: float, noise: Noise,
     rng: np.random.Generator,
-) -> Excess | None:
+) -> Excess | None:  # fmt: skip
     """From repeats where there are enough, else from the stated noise; None without either.
-    `residual` and `left_out` are mean squares in m² with their degrees of freedom: that of the
-    residuals, and that of errors held out, of which the uncertainty of the fits has `own`.
+    `residual` and `left_out` are mean squares in m² with their degrees of freedom: of residuals,
+    with their number, and of errors held out, of which the fits' uncertainty has `own`.
 
-    Where the residuals show that more than noise is left, which the fit followed at its own
-    configurations, τ² = T − σ² − own of the errors T held out, for which the others are new poses.
-    Mean squares are drawn as s² ν/χ²_ν."""
-    test, single, inflated, pure = noise.lack_of_fit, noise.single, np.ones(DRAWS), np.ones(DRAWS)
-    scatter, dof = residual
+    Mean squares of residuals are drawn as s² ν/χ²_ν.  Between configurations that is σ² + n τ²
+    with n readings in a cell of configuration, marker and load; within them σ².  Where it shows
+    that more than noise is left, the fit has followed that at its own configurations: then
+    T − σ² − own is τ², T of the errors held out, for which the others are new poses.  T is drawn
+    about what it is, as resampling configurations would, T χ²_ν / ν."""
+    (scatter, dof, rows), test, single = residual, noise.lack_of_fit, noise.single
+    inflated, n = np.ones(DRAWS), 1.0
     if test is not None and test.dof_pure >= FEWEST_REPEATS:
-        within = _chi2(test.dof_pure, rng)
+        pure = scatter * dof / (test.dof_between * test.F + test.dof_pure)
+        between = pure * test.F * _chi2(test.dof_between, rng)
+        within, n = pure * _chi2(test.dof_pure, rng), rows / (rows - test.dof_pure)
         if not any(s.part for s in noise.sizes or ()):
-            inflated = np.maximum(test.F * _chi2(test.dof_between, rng) / within, 1.0)
-        pure = scatter * dof / (test.dof_between * test.F + test.dof_pure) * within
+            inflated = np.maximum(between / within, 1.0)
     elif noise.ratio_to_stated:
+        pure, told = scatter / noise.ratio_to_stated**2, 0
         if single is not None and single.above:
             # The noise is what single readings say, and the rest of the residual beyond it.
-            pure = single.ratio**2 * _chi2(single.dof, rng)
-        pure = scatter / noise.ratio_to_stated**2 * pure
+            pure, told = pure * single.ratio**2, single.dof
+        own_dof = max(dof - told, 1)
+        between = max(dof * scatter - told * pure, 0.0) / own_dof * _chi2(own_dof, rng)
+        within = pure * _chi2(told, rng) if told else np.full(DRAWS, pure)
     else:
         return None
-    beyond = scatter * _chi2(dof, rng) - pure
+    beyond = (between - within) / n
+    fitted = float(np.maximum(beyond, 0.0).mean())
     if left_out[1] > 0 and np.mean(beyond <= 0) < BEYOND:
-        beyond = left_out[0] * _chi2(left_out[1], rng) - pure - own * inflated
-    return Excess(np.maximum(beyond, 0.0), inflated)
+        T, dof_out = left_out
+        beyond = T * rng.chisquare(dof_out, DRAWS) / dof_out - within - own * inflated
+    return Excess(np.maximum(beyond, 0.0), inflated, fitted)
 
 
-def _chi2(dof: float, rng: np.random.Generator) -> Array:
+def _chi2(dof: int, rng: np.random.Generator) -> Array:
     """Draws (DRAWS,) of ν/χ²_ν: by what factor a mean square may be off."""
     dof = max(dof, 1)
     return np.asarray(dof / rng.chisquare(dof, DRAWS))

@@ -554,7 +554,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""
         table = None if table is None else self.as_visited(table)
-        return scrutiny.uncertainty_budget(self, self.arm, table) if self._looks else None
+        fitted = 0.0 if self.excess is None else self.excess.fitted
+        return scrutiny.uncertainty_budget(self, self.arm, fitted, table) if self._looks else None
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:
@@ -598,13 +599,17 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
 
     @cached_property
     def excess(self) -> prediction.Excess | None:
-        """By how much configurations scatter beyond their noise; None where nothing tells it."""
-        rng = np.random.default_rng(0)
-        scatter = self.residual_rms**2 * len(self.residual) / max(self.dof, 1), self.dof
-        own, dof = self.held_out_told
-        each = self.held_out.reshape(-1, self.observations.size)[:, :3]
-        told = each[np.isfinite(each).all(axis=1)]
-        left_out = float((told**2).sum() / len(told)) if dof else 0.0
+        """By how much configurations scatter beyond their noise; None where nothing tells it.
+        Readings that were set apart may be what the model lacks, and no accidents: each counts
+        there as much as the worst that was kept, at most."""
+        rng, (own, dof) = np.random.default_rng(0), self.held_out_told
+        rows = len(self.residual)
+        scatter = self.residual_rms**2 * rows / max(self.dof, 1), self.dof, rows
+        each = (self.held_out.reshape(-1, self.observations.size)[:, :3] ** 2).sum(axis=1)
+        told = each[np.isfinite(each)]
+        apart = np.array([o.residual for o in self.excluded]) ** 2
+        told = np.append(told, np.minimum(apart, told.max(initial=0.0)))
+        left_out = float(told.mean()) if dof else 0.0
         return prediction.excess_of(scatter, (left_out, dof), own, self.noise, rng)
 
     @checked_arguments

@@ -324,15 +324,17 @@ class UncertaintyBudget:
 
 
 def uncertainty_budget(
-    fit: FoundFit, arm: CalibratedArm, table: Measurements | None = None
+    fit: FoundFit, arm: CalibratedArm, fitted: float, table: Measurements | None = None
 ) -> UncertaintyBudget:
+    """`fitted`: the part of the lack of fit (m²) that residuals have."""
     B, at = fit.B, "the poses fitted"
     if table is not None:
         B, at = fit.model.regressor(table, fit.x).B, table.source
     own, left = mean_squares(arm, B, fit.observations.size)
     visits, readings = (fit.noise_parts.get(part, 0.0) for part in ("visits", "readings"))
-    lack = min(max(arm.lacking**2 - visits, 0.0), readings)
-    squares = (own, left, visits, readings - lack, lack)
+    lack = min(max(fitted - visits, 0.0), readings)
+    beyond = lack * arm.lacking**2 / fitted if fitted else 0.0
+    squares = (own, left, visits, readings - lack, beyond)
     parameters, open_, shared, single, beyond = np.sqrt(squares).tolist()
     return UncertaintyBudget(parameters, open_, shared, single, beyond, at)
 
