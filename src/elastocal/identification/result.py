@@ -636,12 +636,18 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         self, q: ArrayLike | Measurements | DataFrame, load: ArrayLike | None = None
     ) -> Array:
         """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty; of a
-        table (measurements or a data frame) what its readings should be, (n, components).  A table
-        without a reading that was fitted is of another session, as the `test` of `identify`."""
+        table (measurements, a plan, or a data frame) what its readings should be, (n, components).
+        A table without a reading that was fitted is of another session, as the `test` of `identify`.
+        """
         table = self.model.read(q) if hasattr(q, "to_csv") else q
         if isinstance(table, Measurements):
             require(load is None, f"{option('load')} goes with joints; a table states its own")
-            table = self.as_visited(table)
+            blank = np.zeros((len(table), 3))
+            need = {"position": blank, "rotation": blank}
+            if self.model.observe == "distance":
+                need = {"distance": blank[:, 0]}
+            need = {name: zero for name, zero in need.items() if getattr(table, name) is None}
+            table = replace(self.as_visited(table), **need)
             observed = observe(table, self.model.observe)
             return self.model.predict(table, self.x, observed).reshape(-1, observed.size)
         return self.position(table, load).position
