@@ -351,6 +351,8 @@ def too_small(dataset: DiagnosisData, found: ForwardSelection) -> tuple[Untested
     )
     loaded = bool(dataset.table.force.any())
     advice = f"spread the poses over more of the work space{', or raise the load' * loaded}"
+    if dataset.base.model.observe == "distance":
+        advice = "read positions, of which distances to one anchor show less in any pose"
     return tuple(
         Untested(*h.key, reason, advice)
         for h, d in zip(dataset.hypotheses, found.alone.distance, strict=False)

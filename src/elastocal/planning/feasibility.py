@@ -449,6 +449,7 @@ class Feasibility:
 
 # Added to every edge, relative to the longest one: of equally long ways the one with fewer stops.
 PER_EDGE = 1e-9
+AT_ONCE = 64  # moves take hardly longer than one
 
 
 def travel_times(points: Array, speed: Array | None) -> Array:
@@ -519,22 +520,26 @@ class Roadmap:
         return csgraph.shortest_path(self._graph, method="FW", return_predecessors=True)
 
     def parts(self, needed: list[int]) -> list[list[int]]:
-        """`needed` points by what free moves connect, the largest part first.  Checked are those
-        of the shortest trees among `needed`, then through all points, and where some are blocked
-        ever more of the shortest between what is joined so far."""
-        for among in (np.array(needed), np.arange(len(self.points))):
-            within, more = np.ix_(among, among), 1
-            tree = csgraph.minimum_spanning_tree(self._graph[within])
-            while not self.check(among[np.transpose(tree.nonzero())].tolist()):
-                joined = self.checked[within] & np.isfinite(self.direct[within])
-                part = csgraph.connected_components(joined, False)[1]
-                open_ = np.triu((part[:, None] != part) & ~self.checked[within])
-                near = np.argsort(self.times[within][open_], kind="stable")[:more]
-                self.check(among[np.argwhere(open_)[near]].tolist())
-                tree, more = csgraph.minimum_spanning_tree(self._graph[within]), 2 * more
-            label = dict(zip(among, csgraph.connected_components(tree, False)[1], strict=True))
-            names = dict.fromkeys(label[point] for point in needed)
-            found = [[point for point in needed if label[point] == name] for name in names]
+        """`needed` points by what free moves connect, the largest part first.  Few more moves are
+        checked than it takes: those of the shortest trees among `needed`, then through all points,
+        and while some are blocked the shortest from all parts but the largest, ever more at a time:
+        where nothing joins it to the others all of them are blocked."""
+        n, others = len(needed), np.setdiff1d(range(len(self.points)), needed)
+        for among in (np.array(needed), np.append(needed, others)):
+            own, at_once = np.ix_(among, among), AT_ONCE
+            while True:
+                tree = csgraph.minimum_spanning_tree(self._graph[own])
+                free = self.check(among[np.transpose(tree.nonzero())].tolist())
+                known = self.checked[own] & np.isfinite(self.direct[own])
+                part = csgraph.connected_components(known, False)[1]
+                small = np.setdiff1d(part[:n], np.bincount(part[:n]).argmax())
+                new = np.isin(part, small)[:, None] & (part[:, None] != part) & ~self.checked[own]
+                if free or not new.any():
+                    break
+                nearest = np.argsort(self.times[own][new], kind="stable")[:at_once]
+                self.check(among[np.transpose(new.nonzero())[nearest]].tolist())
+                at_once *= 2
+            found = [np.array(needed)[part[:n] == k].tolist() for k in dict.fromkeys(part[:n])]
             if len(found) == 1:
                 break
         return sorted(found, key=len, reverse=True)

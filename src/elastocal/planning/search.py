@@ -33,7 +33,7 @@ from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility, Roadmap, Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.poses import CHUNK, JointSpace, draw, points
-from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, relax
+from elastocal.planning.relaxation import DesignProblem, best_of, exact_plan, exchange, relax
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -590,10 +590,8 @@ class _Ordering:
         rules, pool = self.rules, self.search.pool
         chain, home = rules.chain, rules.cell.design.motion.home
         lower, upper = finite_ranges(chain, *joint_limits(rules.cell, chain))
-        turn = np.where(chain.turning, 2 * np.pi, np.inf)
-        q = pool.q - np.nan_to_num(
-            turn * np.round((pool.q - ((lower + upper) / 2 if home is None else home)) / turn)
-        )
+        near = (lower + upper) / 2 if home is None else home
+        q = pool.q - 2 * np.pi * chain.turning * np.round((pool.q - near) / (2 * np.pi))
         q = np.where((q >= lower) & (q <= upper), q, pool.q)
         off = np.abs(self.search.setup.information.blocks(q, pool.readings) - pool.blocks)
         same = off.max(axis=(1, 2)) <= ROUNDING * np.abs(pool.blocks).max()
@@ -606,30 +604,34 @@ class _Ordering:
 
     def _replace(self, error: Unreachable) -> None:
         """In the place of the poses that cannot be reached, and by exchange in that of others, come
-        those of the LIKELY candidates of a level that a free move joins to the hub."""
+        the best that a free move joins to the hub, looked for among the LIKELY candidates of a
+        level at a time, as long as these better the plan."""
         search, pool, plan = self.search, self.search.pool, self.search.chosen
         problem, gone = search.problem, search.whole(plan)[1][error.poses]
         if (gone >= len(pool)).any():
             raise error
         self.gone += len(gone)
         search.progress(f"{self.gone} poses that no free move reaches are replaced by others")
-        kept = np.setdiff1d(plan, gone)
-        self.hub = self._joined(np.vstack([self.hub, pool.q[kept]]))
-        _, worth = problem.worth(inverse(problem.information(plan)))
-        some = [kept]
-        for level, share in enumerate(problem.shares):
-            own = np.setdiff1d(np.flatnonzero(problem.group == level), plan)
-            ranked, n = own[np.argsort(-worth[own], kind="stable")], 0
-            while len(ranked) and n < share:
-                tried, ranked = ranked[:LIKELY], ranked[LIKELY:]
-                some.append(tried[self._reached(pool.q[tried])])
-                n += len(some[-1])
-        left = np.sort(np.concatenate(some))
-        if (np.bincount(problem.group[left], minlength=len(problem.shares)) < problem.shares).any():
+        left = now = np.setdiff1d(plan, gone)
+        self.hub = self._joined(np.vstack([self.hub, pool.q[now]]))
+        new, least = np.setdiff1d(np.arange(len(pool)), plan), np.inf
+        while len(new):
+            _, worth = problem.worth(inverse(problem.information(now)))
+            tried = new[
+                best_of(worth[new], problem.group[new], np.full(len(problem.shares), LIKELY))
+            ]
+            new = np.setdiff1d(new, tried)
+            left = np.union1d(left, tried[self._reached(pool.q[tried])])
+            part = problem.restricted(left)
+            if (np.bincount(part.group, minlength=len(problem.shares)) < problem.shares).any():
+                continue
+            chosen, value = exchange(part, part.fitted(np.searchsorted(left, now)))
+            if value > least * (1 - CLOSE):
+                break
+            now, least = left[chosen], value
+        if np.isinf(least):
             raise error
-        part = problem.restricted(left)
-        begun = part.fitted(np.searchsorted(left, kept))
-        search.exchange(left[exchange(part, begun)[0]])
+        search.exchange(now)
 
     def _joined(self, q: Array) -> Array:
         motion = self.rules.cell.design.motion
