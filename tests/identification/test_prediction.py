@@ -18,19 +18,13 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 
 SIGMA, POSES = 5e-5, 40
-
-
 TRACKER = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
-
-
-def fitted(seed: int):
-    model, table, x = campaign(GEOMETRY, POSES, seed, tracker=TRACKER)
-    return identify(model, table), x
 
 
 @pytest.fixture(scope="module")
 def fits():
-    return [fitted(seed) for seed in range(5)]
+    campaigns = (campaign(GEOMETRY, POSES, seed, tracker=TRACKER) for seed in range(5))
+    return [(identify(model, table), x) for model, table, x in campaigns]
 
 
 def test_regions_hold_the_tool_as_often_as_they_say(fits):
@@ -44,10 +38,8 @@ def test_regions_hold_the_tool_as_often_as_they_say(fits):
         assert (at.half_axes() >= at.half_axes(0.5)).all() and at.holds(at.position).all()
         twice = replace(at, visit=at.covariance)
         np.testing.assert_allclose(twice.half_axes(visit=True), np.sqrt(2) * at.half_axes())
-        for size, inside in (
-            (1.4 * at.half_axes()[:, 2:], True),
-            (1.5 * at.half_axes()[:, :1], False),
-        ):
+        axes = at.half_axes()
+        for size, inside in (1.4 * axes[:, 2:], True), (1.5 * axes[:, :1], False):
             assert (twice.holds(at.position + size * [1, 0, 0], visit=True) == inside).all()
     assert 0.85 < np.mean(held) <= 1.0
 

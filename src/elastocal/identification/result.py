@@ -232,8 +232,8 @@ def remedies() -> dict[str, str]:
         "rounded until they agree should be given with all their digits.",
         **dict.fromkeys(("few_configurations", "fit_flatters", "new_poses_no_gain"), more_poses()),
         "few_degrees_of_freedom": "Measure more poses.",
-        "hardly_shown": "Strain what the readings hardly show: by a load in another direction or a "
-        "larger one ([design] loads_N, for which elastocal design plans poses), or give it a prior.",
+        "hardly_shown": "Strain what the readings hardly show by a larger load, or one in another "
+        "direction ([design] loads_N, for which elastocal design plans poses), or give it a prior.",
         "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
         "parameters.",
         "knowledge_contradicted": "Check names, units and signs of what is stated, and whether the "
@@ -649,18 +649,15 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         self, q: ArrayLike | Measurements | DataFrame, load: ArrayLike | None = None
     ) -> Array:
         """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty; of a
-        table (measurements, a plan, or a data frame) what its readings should be, (n, components).
-        A table without a reading that was fitted is of another session, as the `test` of `identify`.
-        """
+        table (measurements, a plan, a data frame) what its readings should be, (n, components).  A
+        table without a reading that was fitted is of another session, as `test` of `identify`."""
         table = self.model.read(q) if hasattr(q, "to_csv") else q
         if isinstance(table, Measurements):
             require(load is None, f"{option('load')} goes with joints; a table states its own")
-            blank = np.zeros((len(table), 3))
-            need = {"position": blank, "rotation": blank}
-            if self.model.observe == "distance":
-                need = {"distance": blank[:, 0]}
-            need = {name: zero for name, zero in need.items() if getattr(table, name) is None}
-            table = replace(self.as_visited(table), **need)
+            table = self.as_visited(table)
+            if (table.distance if self.model.observe == "distance" else table.position) is None:
+                blank = np.zeros((len(table), 3))  # what a plan reads counts for nothing
+                table = replace(table, position=blank, rotation=blank, distance=blank[:, 0])
             observed = observe(table, self.model.observe)
             return self.model.predict(table, self.x, observed).reshape(-1, observed.size)
         return self.position(table, load).position
