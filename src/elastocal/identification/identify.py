@@ -244,7 +244,6 @@ def left_out(model: Model, observed: Observations, fixed: tuple[str, ...]) -> Ar
 
 
 CORRELATED = 0.9
-IDLE = 1e-3  # of the error at new poses: they do not depend on it
 NOT_SHOWN = "held: the readings do not show the smooth function that it is part of"
 
 
@@ -305,10 +304,6 @@ def summarise(
     )  # fmt: skip
     errors = None if test is None else _test_errors(model, result, test)
     result = replace(result, predicted=predicted, test=errors)
-    if there.any() and predicted is not None and predicted.unchecked <= IDLE * predicted.rms:
-        # What a session's first visit alone shows: no new pose is one.
-        others = heldout[np.repeat(there.reshape(-1, observed.size).all(axis=1), observed.size)]
-        result = replace(result, heldout_rms=rms_3d(others, observed.size))
     result = judged(result, solution, every.problem.observations.table)
     result = replace(result, scatter=_scatter(result, solution, course.options))
     notes = (f"The robot's file: {note}." for note in model.chain.notes)
