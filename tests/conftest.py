@@ -37,10 +37,8 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="module", autouse=True)
 def short_search(request: pytest.FixtureRequest) -> Iterator[None]:
     """One lot of new points and no second for the bound on the continuum, which in pools as small
-    as those of tests is searched again and again; few steps in search of an order.
-
-    One start of the search instead of several.
-    """
+    as those of tests is searched again and again; few steps in search of an order.  One start of
+    the search instead of several."""
     if WHOLE & {*request.path.parts} or getattr(request.module, "WHOLE_SEARCH", False):
         yield
         return

@@ -1,7 +1,5 @@
 """What every table that people hand us has in common: comments, empty cells, headers, and CSV."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -13,14 +11,11 @@ from hypothesis import strategies as st
 from elastocal.messages import InputError, cell_text
 from elastocal.tables import NO_UNIT, Family, csv_text, match_columns, read_table
 
-FAMILIES = {
-    family.name: family
-    for family in (
-        Family("name", "names", {"name": NO_UNIT}, is_label=True, optional=("name",)),
-        Family("place", "places", {"x": ("mm", "m"), "y": ("mm", "m")}),
-        Family("end", "ends", dict.fromkeys(("low", "high"), ("N",)), optional=("low", "high")),
-    )
-}
+FAMILIES = {family.name: family for family in (
+    Family("name", "names", {"name": NO_UNIT}, is_label=True, optional=("name",)),
+    Family("place", "places", {"x": ("mm", "m"), "y": ("mm", "m")}),
+    Family("end", "ends", dict.fromkeys(("low", "high"), ("N",)), optional=("low", "high")),
+)}  # fmt: skip
 
 
 def read(text, **options):

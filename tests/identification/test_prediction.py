@@ -57,9 +57,7 @@ def test_predicted_error_is_that_at_new_poses(fits):
     errors = np.array([error_of(fit, fit.model, x) for fit, x in fits])
     found = [fit.predicted for fit, _ in fits]
     assert all(f.ci95[0] < f.rms < f.ci95[1] for f in found)
-    assert all(
-        fit.predicted.rms < fit.heldout_rms for fit, _ in fits
-    )  # which has a reading's noise
+    assert all(f.predicted.rms < f.heldout_rms for f, _ in fits)  # which has a reading's noise
     assert 0.3 < np.mean((errors / [f.rms for f in found]) ** 2) < 1.5
     assert sum(errors <= [f.ci95[1] for f in found]) >= 4
 
@@ -91,8 +89,8 @@ def test_springs_that_no_load_has_shown_count_where_the_arm_works_under_one():
 @pytest.mark.parametrize("sideways", [0.0, 300.0])
 def test_a_pose_that_alone_shows_a_parameter_counts_by_its_share_of_the_error(sideways):
     """Only one pose's load pulls aside, which shows joint 1; under a weight it does not matter."""
-    cell = cell_of(("joint_compliance",), observe="deflection", tracker=TRACKER)
-    model = Model.assembled(planar_chain(), cell)
+    springs = cell_of(("joint_compliance",), observe="deflection", tracker=TRACKER)
+    model = Model.assembled(planar_chain(), springs)
     q = random_poses(model.chain, 30, 3)
     force = np.tile([[0.0, 0, 0], [0, 0, -300]], (30, 1, 1))
     force[-1, 1, 1] = 30.0
@@ -102,6 +100,5 @@ def test_a_pose_that_alone_shows_a_parameter_counts_by_its_share_of_the_error(si
     poses = NewPoses(where, load, np.full(100, 0.01), "here")
     fit = identify(model, table, new_poses=poses)
     assert np.isinf(fit.heldout_rms)
-    told = fit.finding("not_held_out")
-    assert (told.severity == "note") == fit.verdict.trusted == (not sideways)
+    assert (fit.finding("not_held_out").severity == "note") == fit.verdict.trusted == (not sideways)
     assert (fit.predicted.unchecked**2 > fit.predicted.rms**2 / 2) == bool(sideways)
