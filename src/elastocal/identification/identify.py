@@ -12,7 +12,7 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import sparse
 
 from elastocal.identification.faulty_readings import FaultyGroup, OutlierReport, report_faulty
 from elastocal.identification.findings import KNOWN_NOISE, judged, warning_sentences
@@ -371,9 +371,8 @@ def _held_out(
         own = float(np.mean(known**2)) if len(known) else 0.0
         shown = ShownPoses(float(std.max()), len(std)) if len(known) == len(std) else None
     if not solution.problem.large and solution.held is None:
-        Q, R = linalg.qr(weights.apply(fit.B), mode="economic")
-        seen = linalg.solve_triangular(R, fit.B.T, trans="T").T
-        off += drawn_by_each(seen, Q, fit.whitened, held, rows)
+        seen = fit.B @ fit.r_factor.half
+        off += drawn_by_each(seen, weights.apply(seen), fit.whitened, held, rows)
     n = int(told.sum())
     spread = float((off[told] ** 2).sum()) * n / max(n - 1, 1)
     dof = 2 * square.sum() ** 2 / spread if n > 1 and spread > 0 else 0.0
