@@ -501,7 +501,8 @@ def readings_at(
 ) -> tuple[Array, Array]:
     """B (R, size, parameters) of readings at new poses, one for each pose and marker, and their
     weight (R,) of sum 1; without those that have no static equilibrium, if any has one.  Whatever
-    else the model asks for, as times and temperatures, is that of the readings in turn."""
+    else the model asks for, as times and temperatures, is that of the readings in turn; none is the
+    first of a session."""
     table = observed.table
     markers = np.unique(table.marker[observed.lead])
     states = 2 if model.observe == "deflection" else 1
@@ -514,7 +515,7 @@ def readings_at(
         configuration=pose, configuration_labels=tuple(map(str, range(1, T + 1))),
         repeat=np.zeros(len(pose), dtype=np.int64), marker=np.tile(np.repeat(markers, states), T),
         force=poses.force[pose] * loaded[:, None],
-    )  # fmt: skip
+    ).from_neither_side()  # fmt: skip
     still = np.isfinite(model.deflection(new, x)).all(axis=1)
     good = np.bincount(pose, ~still, minlength=T) == 0
     new = new.take(good[pose])

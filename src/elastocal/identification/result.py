@@ -232,8 +232,8 @@ def remedies() -> dict[str, str]:
         "rounded until they agree should be given with all their digits.",
         **dict.fromkeys(("few_configurations", "fit_flatters", "new_poses_no_gain"), more_poses()),
         "few_degrees_of_freedom": "Measure more poses.",
-        "hardly_shown": "Measure poses and loads that strain what the readings hardly show "
-        "(elastocal design plans them), or give it a prior.",
+        "hardly_shown": "Strain what the readings hardly show by a larger load, or one in another "
+        "direction ([design] loads_N, for which elastocal design plans poses), or give it a prior.",
         "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
         "parameters.",
         "knowledge_contradicted": "Check names, units and signs of what is stated, and whether the "
