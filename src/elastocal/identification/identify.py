@@ -269,7 +269,7 @@ def summarise(
     faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage, _ = solution.crossed
-    shown, held_out_told = _held_out(solution, covariance)
+    shown, own = _shown(solution, covariance)
     there = np.isfinite(heldout)  # under a drift one that is not would reach all
     plainly_large = problem.large and solution.held is None
     report, stated = None, found.contradicted
@@ -282,7 +282,7 @@ def summarise(
         determined=determined, spread=found.spread,
         correlations=tuple(sorted(pairs, key=lambda pair: -abs(pair[2]))),
         observations=observed, residual=final.residual, held_out=heldout, sigma=sigma,
-        held_out_told=held_out_told,
+        held_out_told=(own, _held_out_dof(solution)),
         dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
         heldout_rms=rms_3d(heldout, observed.size), nominal_rms=solution.nominal_rms,
         converged=final.converged, reason=final.reason, outliers=() if set_apart else faulty,
@@ -349,34 +349,37 @@ def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatt
     return Scatter(found.matrix, found.dof) if found.dof.all() else None
 
 
-def _held_out(
-    solution: Solution, covariance: Array
-) -> tuple[ShownPoses | None, tuple[float, float]]:
-    """How sure the fit is where it was measured, where the others tell each configuration; the mean
-    square in m² that this has in the errors held out; and the degrees of freedom ν of the mean
-    square T of these, whose variance is 2T²/ν as configurations show it."""
-    fit, observed, (held, _, left) = solution.fit, solution.problem.observations, solution.crossed
-    weights, labels = solution.problem.weights, observed.configuration
-    labels = labels if weights.together is None else weights.together
-    counted = np.isfinite(held) & (np.arange(len(held)) % observed.size < 3)
-    held, rows = np.where(counted, held, 0.0), np.repeat(labels, observed.size)
-    _, code = np.unique(rows, return_inverse=True)
+def _shown(solution: Solution, covariance: Array) -> tuple[ShownPoses | None, float]:
+    """How sure the fit is where it was measured, where the others tell each configuration; and the
+    mean square in m² that this has in the errors held out, 0 of a large table."""
+    observed, left = solution.problem.observations, solution.crossed[2]
+    if solution.problem.large or not np.isfinite(covariance).all():
+        return None, 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        std = uncertainty_of(observed, solution.fit.B, covariance, left)
+    known = std[np.isfinite(std)]
+    own = float(np.mean(known**2)) if len(known) else 0.0
+    return ShownPoses(float(std.max()), len(std)) if len(known) == len(std) else None, own
+
+
+def _held_out_dof(solution: Solution) -> float:
+    """Degrees of freedom ν of the mean square T of errors held out, whose variance is 2T²/ν as
+    configurations show it: by their own squares, and by how each draws the fit to the others where
+    that is plain least squares of a table that is not large; 0 where fewer than two are told."""
+    fit, problem, held = solution.fit, solution.problem, solution.crossed[0]
+    weights, size = problem.weights, problem.observations.size
+    labels = problem.observations.configuration if weights.together is None else weights.together
+    code, counted = np.repeat(numbered(labels), size), np.arange(len(held)) % size < 3
+    counted &= np.isfinite(held)
+    held = np.where(counted, held, 0.0)
     square, count = np.bincount(code, held**2), np.bincount(code, counted)
-    off, told = square - square.sum() / max(count.sum(), 1) * count, count > 0
-    shown, own = None, 0.0
-    if not solution.problem.large and np.isfinite(covariance).all():
-        with np.errstate(divide="ignore", invalid="ignore"):
-            std = uncertainty_of(observed, fit.B, covariance, left)
-        known = std[np.isfinite(std)]
-        own = float(np.mean(known**2)) if len(known) else 0.0
-        shown = ShownPoses(float(std.max()), len(std)) if len(known) == len(std) else None
-    if not solution.problem.large and solution.held is None:
+    off = square - square.sum() / max(count.sum(), 1) * count
+    if not problem.large and solution.held is None:
         seen = fit.B @ fit.r_factor.half
-        off += drawn_by_each(seen, weights.apply(seen), fit.whitened, held, rows)
-    n = int(told.sum())
-    spread = float((off[told] ** 2).sum()) * n / max(n - 1, 1)
-    dof = 2 * square.sum() ** 2 / spread if n > 1 and spread > 0 else 0.0
-    return shown, (own, float(dof))
+        off += drawn_by_each(seen, weights.apply(seen), fit.whitened, held, code)
+    off = off[count > 0]
+    spread = float((off**2).sum()) * len(off) / max(len(off) - 1, 1)
+    return float(2 * square.sum() ** 2 / spread) if len(off) > 1 and spread > 0 else 0.0
 
 
 def _estimates(

@@ -372,20 +372,18 @@ def left_out(
         yield rows, np.asarray(moved[..., 0], dtype=np.float64), alone
 
 
-def drawn_by_each(B: Array, Q: Array, e: Array, held: Array, configuration: IntArray) -> Array:
+def drawn_by_each(B: Array, Q: Array, e: Array, held: Array, code: IntArray) -> Array:
     """By how much (C,) the squares of errors h that are `held` out (rows,; 0 where none counts)
     change with the weight of each configuration j, which draws the fit to the others towards it:
     −2 Σ_c h_cᵀ B_c (I − Q_cᵀQ_c)⁻¹ Q_jᵀ e_j, c ≠ j (infinitesimal jackknife).  B and Q as in
-    `growth`, whitened residuals e; configurations in the order of their numbers."""
-    code = np.unique(configuration, return_inverse=True)[1]
-    pulls = np.zeros((2, code.max() + 1, Q.shape[1]))
-    for rows in same_size(code):
-        Qt, h = Q[rows].transpose(0, 2, 1), B[rows].transpose(0, 2, 1) @ held[rows][..., None]
-        # One without errors that count, as it tells a direction alone, may have no such inverse.
-        gap = np.eye(Q.shape[1]) - Qt @ Q[rows] * np.any(h, axis=1, keepdims=True)
-        pulls[0, code[rows[:, 0]]] = np.linalg.solve(gap, h)[..., 0]
-        pulls[1, code[rows[:, 0]]] = (Qt @ e[rows][..., None])[..., 0]
-    return np.asarray(-2 * ((pulls[0].sum(axis=0) - pulls[0]) * pulls[1]).sum(axis=1))
+    `growth`, whitened residuals e; `code` (rows,) numbers the configurations."""
+    pulled, own = np.zeros((2, code.max() + 1, Q.shape[1]))
+    np.add.at(pulled, code, B * held[:, None])
+    np.add.at(own, code, Q * e[:, None])
+    # (I − QᵀQ)⁻¹ = I + Qᵀ(I − QQᵀ)⁻¹Q
+    for rows, moved, _ in left_out(Q, (Q * pulled[code]).sum(axis=1), code):
+        pulled[code[rows[:, 0]]] += moved
+    return np.asarray(-2 * ((pulled.sum(axis=0) - pulled) * own).sum(axis=1))
 
 
 def share_left(Q: Array, configuration: IntArray) -> Array:

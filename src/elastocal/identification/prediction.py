@@ -426,13 +426,13 @@ def excess_of(
         if not any(s.part for s in noise.sizes or ()):
             inflated = np.maximum(between / within, 1.0)
     elif noise.ratio_to_stated:
-        pure, told = scatter / noise.ratio_to_stated**2, 0
+        pure, of_single = scatter / noise.ratio_to_stated**2, 0
         if single is not None and single.above:
             # The noise is what single readings say, and the rest of the residual beyond it.
-            pure, told = pure * single.ratio**2, single.dof
-        own_dof = max(dof - told, 1)
-        between = max(dof * scatter - told * pure, 0.0) / own_dof * _chi2(own_dof, rng)
-        within = pure * _chi2(told, rng) if told else np.full(DRAWS, pure)
+            pure, of_single = pure * single.ratio**2, single.dof
+        rest = max(dof - of_single, 1)
+        between = max(dof * scatter - of_single * pure, 0.0) / rest * _chi2(rest, rng)
+        within = pure * _chi2(of_single, rng) if of_single else np.full(DRAWS, pure)
     else:
         return None
     beyond = (between - within) / n

@@ -355,12 +355,11 @@ def _certificate(plan: Plan) -> Iterator[str]:
         )
     if c.starts and bound is not None:
         ends = " to ".join(dict.fromkeys(rounded(e, 4) for e in (min(c.starts), max(c.starts))))
-        above = plan.reported > max(c.starts)
         yield (
             f"{say.counted(len(c.starts), 'start')} of the search ended with {name} = "
             f"{f'{ends} {plan.unit}'.rstrip()}, the bound is {_value(plan, bound)}. The difference "
             "is what no start found, or what only weights can reach: the fewer poses, the more of "
-            "the latter." + " The plan is above both: no free move reaches some poses." * above
+            "the latter."
         )
 
 
