@@ -35,7 +35,7 @@ from elastocal.identification.identify import left_out
 from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.noise_summary import BEYOND, single_readings
-from elastocal.identification.outliers import settle
+from elastocal.identification.outliers import FEW, follow_poses, settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
 from elastocal.measurements import numbered, rounded_joints
 from elastocal.messages import ElastocalError
@@ -427,7 +427,6 @@ def with_intervals(drawn: Array) -> tuple[float, Interval, Interval]:
 # Faulty readings: those that noise does not explain, as in identification; of which each joint has
 # a part where several markers of a visit tell that from the arm's own errors.
 
-MOST = 0.1  # share of readings from which on "faulty" is no accident of measuring
 RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 
 
@@ -457,7 +456,7 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
         return np.zeros_like(good)
 
     suspects = contradicted(B, e)
-    if suspects.mean() > MOST:
+    if suspects.mean() > FEW or follow_poses(base.observed, suspects):
         return np.zeros_like(suspects), suspects
     faulty = suspects & ~in_a_run(dataset, suspects)
     whole = np.flatnonzero((in_visit > 1) & (np.bincount(blocks.visit, ~suspects) == 0))

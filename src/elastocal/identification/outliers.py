@@ -31,7 +31,7 @@ from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import Problem, RFactor
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.model.observations import Observations
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
 TINY = np.finfo(float).tiny
@@ -226,6 +226,7 @@ def until_it_stands(
 # What slipped, or was misread for a while, follows the lines; a missing effect pose and load.
 
 FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
+CLEAR = 0.05  # chance that accidents lie beside each other in the order of a joint, or at its end
 
 
 def drops(
@@ -236,29 +237,57 @@ def drops(
     accidents, or but for those `explained` by one common shift each, whose cause is known, few."""
     if options.faulty != "auto" or are_accidents(observed, faulty):
         return bool(faulty.any()) and options.faulty != "keep"
-    return explained is not None and bool((faulty & ~explained()).mean() <= FEW)
+    if explained is None or follow_poses(observed, faulty):
+        return False
+    return bool((faulty & ~explained()).mean() <= FEW)
 
 
 def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
-    return bool(faulty.mean() <= FEW or _by_chance(observed, faulty) < FALSE_ALARM)
+    if faulty.mean() > FEW:
+        return _by_chance(observed, faulty) < FALSE_ALARM
+    return not follow_poses(observed, faulty)
 
 
 def _by_chance(observed: Observations, faulty: BoolArray) -> float:
     """Chance that the `faulty` ones (N,) follow each other in the order of lines, of all or of each
-    marker, as they do, over the chance of what the order of any joint within a load state shows.
+    marker, as they do, over the chance of what the order of any joint within a load state shows."""
+    each = [_in_turn(observed, faulty, m) for m in (None, observed.table.marker[observed.lead])]
+    return 2 * min(line / max(joint, TINY) for line, joint in each)
+
+
+def follow_poses(observed: Observations, faulty: BoolArray) -> bool:
+    """Whether the `faulty` ones (N,), most readings of their configurations, lie beside each other
+    in the order of a joint, or at one of its ends, clearly more than in the order of the lines:
+    there the arm errs.  That k of n are among the m nearest to an end has the chance
+    C(m, k) / C(n, k)."""
+    _, first, of = np.unique(observed.configuration, return_index=True, return_inverse=True)
+    q, hit = observed.table.q[observed.lead[first]], np.bincount(of, faulty) > 0
+    n, k = len(hit), int(hit.sum())
+    if 2 * faulty.sum() < hit[of].sum() or not k:
+        return False
+    line, near = _in_turn(observed, faulty, None)
+    m = np.stack([(q >= q[hit].min(axis=0)).sum(axis=0), (q <= q[hit].max(axis=0)).sum(axis=0)])
+    ends = np.exp(special.betaln(n - k + 1, k + 1) - special.betaln(m - k + 1, k + 1))
+    ends *= (n + 1) / (m + 1)
+    return bool(3 * q.shape[1] * min(near, float(ends.min())) < CLEAR * line)
+
+
+def _in_turn(
+    observed: Observations, faulty: BoolArray, marker: IntArray | None
+) -> tuple[float, float]:
+    """Chance that the `faulty` ones (N,) follow each other as they do in the order of the lines,
+    and of the joint within a load state that shows it most, by `marker` (N,) or all together.
     What is read before the arm moves on counts once: it has the errors of its pose in common."""
     table, lead = observed.table, observed.lead
-    line, marker, q = table.row[lead], table.marker[lead], table.q[lead]
+    line, q = table.row[lead], table.q[lead]
     order, stay = np.argsort(line), np.zeros(len(line), dtype=np.int64)
     where = table.configuration[lead][order]
     stay[order] = np.cumsum(np.diff(where, prepend=where[0]) != 0)
-    odds = []
-    for group in (np.zeros_like(marker), marker):
-        _, first, of = np.unique([group, stay], axis=1, return_index=True, return_inverse=True)
-        hit, g, load = np.bincount(of, faulty) > 0, group[first], observed.load[first]
-        near = min(_so_few_runs(hit, joint, load, g) for joint in q[first].T)
-        odds.append(_so_few_runs(hit, line[first], g) / max(near, TINY))
-    return 2 * min(odds)
+    by = np.zeros_like(stay) if marker is None else marker
+    _, first, of = np.unique([by, stay], axis=1, return_index=True, return_inverse=True)
+    hit, g, load = np.bincount(of, faulty) > 0, by[first], observed.load[first]
+    near = min(_so_few_runs(hit, joint, load, g) for joint in q[first].T)
+    return _so_few_runs(hit, line[first], g), near
 
 
 def _so_few_runs(faulty: BoolArray, *keys: ArrayLike) -> float:
