@@ -56,6 +56,16 @@ def test_dropping_equals_never_having_had_them():
     assert dropped.heldout_rms == pytest.approx(never.heldout_rms, rel=1e-4)
 
 
+@pytest.mark.parametrize("at_an_end", [False, True])
+def test_accidents_are_set_apart_and_what_errs_at_the_end_of_a_joint_is_the_arms(at_an_end):
+    model, table, _ = campaign(poses=60, seed=2)
+    bad = np.argsort(table.q[:, 1])[-4:] if at_an_end else np.array([5, 20, 31, 48])
+    position = table.position + 1e-3 * np.isin(np.arange(60), bad)[:, None]
+    result = identify(model, replace(table, position=position))
+    assert set(rows_of(result.outliers if at_an_end else result.excluded)) == set(bad)
+    assert bool(result.excluded) != at_an_end
+
+
 def test_stated_sigmas_count():
     """A reading of sigma 2 mm off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm is."""
     model, exact, _ = campaign(seed=9, sigma=0.0)

@@ -611,8 +611,9 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if apart := result.excluded:
             yield (
                 f"{counted(len(apart), 'outlier was', 'outliers were')} excluded "
-                f"({_runs(o.line for o in apart)}): mistakes, or signs of a missing effect. All "
-                f"are listed in the result as 'excluded'; {option('outliers', 'keep')} keeps them."
+                f"({_runs(o.line for o in apart)}) as mistakes. If the arm was there, its error at new "
+                f"poses is larger than told: {option('outliers', 'keep')} keeps them and tells it. "
+                "All are listed in the result as 'excluded'."
             )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
