@@ -99,6 +99,6 @@ def test_a_pose_that_alone_shows_a_parameter_counts_by_its_share_of_the_error(si
     where, load = random_poses(model.chain, 100, 5), np.tile([0.0, sideways, -300], (100, 1))
     poses = NewPoses(where, load, np.full(100, 0.01), "here")
     fit = identify(model, table, new_poses=poses)
-    assert np.isinf(fit.heldout_rms)
+    assert 0.5 * SIGMA < fit.heldout_rms < 3 * SIGMA and np.isinf(fit.held_out).sum() == 3
     assert (fit.finding("not_held_out").severity == "note") == fit.verdict.trusted == (not sideways)
     assert (fit.predicted.unchecked**2 > fit.predicted.rms**2 / 2) == bool(sideways)

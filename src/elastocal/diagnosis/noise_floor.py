@@ -377,7 +377,7 @@ def rms_with_interval(
     return resampled_rms(*squared_lengths(data, packed), rng)
 
 
-FEW = 10  # rows
+SPARE = 10  # rows
 
 
 def first_steps(
@@ -385,7 +385,7 @@ def first_steps(
 ) -> list[BudgetStep]:
     """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
     the weights of an ordinary calibration: scatter of joints that is fitted beside a missing effect
-    is that effect, and weights by it would spare it.  Where there are FEW rows to a parameter, what
+    is that effect, and weights by it would spare it.  Where there are no SPARE rows to a parameter, what
     is held of those hardly shown decides, and `identify` says it."""
     base, data, blocks = dataset.base, dataset.data, dataset.blocks
     rows, good = base.nominal.reshape(-1, blocks.size, 1).copy(), ~data.faulty
@@ -407,7 +407,7 @@ def first_steps(
             X = np.concatenate([blocks.pack(B), X[:, :, len(own) :]], axis=2)
         part = replace(data, X=X[:, :, stage <= k], precision=data.precision[stage <= k])
         left = left_out_residual(project(part, noise.of_instrument()))
-        few = data.n_rows < FEW * part.X.shape[2]
+        few = data.n_rows < SPARE * part.X.shape[2]
         with suppress(ElastocalError):
             held = left_out(base.model, subset(base.observed, good), later) if few else np.inf
             if np.isfinite(held).all():

@@ -158,7 +158,7 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
     n = len(result.observations.value) - result.dof
     if result.dof < FEW_DOF_PER_PARAMETER * n:
         yield _note("few_degrees_of_freedom", dof=result.dof, parameters=n)
-    if not math.isfinite(result.heldout_rms):
+    if not np.isfinite(result.held_out).all():
         # Test data check it; it matters little where it is the smaller part of the error.
         found, numbers = result.predicted, {}
         if found is not None and math.isfinite(found.unchecked):
@@ -611,8 +611,8 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if apart := result.excluded:
             yield (
                 f"{counted(len(apart), 'outlier was', 'outliers were')} excluded "
-                f"({_runs(o.line for o in apart)}) as mistakes. If the arm was there, its error at new "
-                f"poses is larger than told: {option('outliers', 'keep')} keeps them and tells it. "
+                f"({_runs(o.line for o in apart)}) as mistakes. If the arm was there, its error at "
+                f"new poses is larger than told: {option('outliers', 'keep')} tells it. "
                 "All are listed in the result as 'excluded'."
             )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":

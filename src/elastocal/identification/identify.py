@@ -37,7 +37,14 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.noise_summary import noise_of, summarise_residuals
-from elastocal.identification.outliers import describe, drops, find_faulty, robust_result, settle
+from elastocal.identification.outliers import (
+    FEW,
+    describe,
+    drops,
+    find_faulty,
+    robust_result,
+    settle,
+)
 from elastocal.identification.prediction import (
     NewPoses,
     fitted_too,
@@ -271,6 +278,7 @@ def summarise(
     heldout, leverage, _ = solution.crossed
     shown, own = _shown(solution, covariance)
     there = np.isfinite(heldout)  # under a drift one that is not would reach all
+    counted = heldout[there] if there.mean() > 1 - FEW else heldout
     plainly_large = problem.large and solution.held is None
     report, stated = None, found.contradicted
     if not every.exact:
@@ -284,7 +292,7 @@ def summarise(
         observations=observed, residual=final.residual, held_out=heldout, sigma=sigma,
         held_out_told=(own, _held_out_dof(solution)),
         dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
-        heldout_rms=rms_3d(heldout, observed.size), nominal_rms=solution.nominal_rms,
+        heldout_rms=rms_3d(counted, observed.size), nominal_rms=solution.nominal_rms,
         converged=final.converged, reason=final.reason, outliers=() if set_apart else faulty,
         excluded=faulty if set_apart else (), warnings=(),
         residual_summary=summarise_residuals(

@@ -319,8 +319,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         sigma: Standard deviation of the residual per whitened row (in m with unit weights).
         dof: Its degrees of freedom.
         residual_rms: 3-D rms of `residual`, in m.
-        heldout_rms: That of `held_out`, without readings that were set apart.  Infinite where none
-            could be held out.
+        heldout_rms: That of `held_out`, without readings that were set apart and configurations
+            that alone determine something.  Infinite where a tenth of all or more do.
         nominal_rms: That of the nominal arm, placed but not calibrated.
         converged: Whether the fit converged; `reason` says how it ended.
         outliers: Readings beyond the noise that had a part in the fit.
@@ -492,7 +492,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """The held-out 3-D rms in m with the readings that were set apart, by their errors under
         the fit to the others; infinite where none could be held out."""
         apart = sum(o.residual**2 for o in self.excluded)
-        n, k = len(self.observations.lead), len(self.excluded)
+        n, k = np.isfinite(self.held_out).sum() / self.observations.size, len(self.excluded)
         return math.sqrt((n * self.heldout_rms**2 + apart) / (n + k))
 
     def __getitem__(self, name: str) -> Estimate:

@@ -86,7 +86,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "no_better_than_nominal": "the held-out error ({heldout_rms_um} rms) is not below that of the "
     "nominal arm ({nominal_rms_um})",
     "not_held_out": lambda f: (
-        "there is no held-out error: some pose alone determines a parameter, and nothing checks it"
+        "some pose alone determines a parameter, and nothing checks it"
         + (
             f" ({_length(f, 'unchecked_um')} of the {_length(f, 'rms_um')} expected at new poses)"
             if f.numbers
