@@ -385,8 +385,8 @@ def first_steps(
 ) -> list[BudgetStep]:
     """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
     the weights of an ordinary calibration: scatter of joints that is fitted beside a missing effect
-    is that effect, and weights by it would spare it.  Where there are no SPARE rows to a parameter, what
-    is held of those hardly shown decides, and `identify` says it."""
+    is that effect, and weights by it would spare it.  Where there are no SPARE rows to a parameter,
+    what is held of those hardly shown decides, and `identify` says it."""
     base, data, blocks = dataset.base, dataset.data, dataset.blocks
     rows, good = base.nominal.reshape(-1, blocks.size, 1).copy(), ~data.faulty
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(data, blocks.pack(rows)[:, :, 0], rng))]
