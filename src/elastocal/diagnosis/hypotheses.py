@@ -339,14 +339,15 @@ def times_of(visits: Measurements) -> Array:
 
 
 def moments_of_change(time: Array, visit: IntArray) -> Moments:
-    """Every moment (n,) between two visits, two at least on either side, and the log of its prior:
-    half alike for all, half by how long there was for a change, as between sessions.  By the `time`
-    (readings,) and the `visit` of each: none is cut in two, unless others were made meanwhile."""
+    """Every moment (n,) between two visits, three at least on either side (a frame that jumps
+    explains whatever two say of one marker), and the log of its prior: half alike for all, half by
+    how long there was for a change, as between sessions.  By the `time` (readings,) and the `visit`
+    of each: none is cut in two, unless others were made meanwhile."""
     order = np.lexsort((time, visit))
     t, last = time[order], np.flatnonzero(np.diff(visit[order], append=-1))
     begun, ended = t[np.append(0, last[:-1] + 1)], t[last]
     order = np.argsort(begun, kind="stable")
-    low, high, ended = begun[order][1:-2], begun[order][2:-1], ended[order][1:-2]
+    low, high, ended = begun[order][2:-3], begun[order][3:-2], ended[order][2:-3]
     moments, k = np.unique((np.where(ended < high, ended, low) + high) / 2, return_index=True)
     if not len(moments):
         return np.array([begun.mean()]), np.zeros(1)
