@@ -497,9 +497,8 @@ def schedule(
     (N, L), one load state after the other.  A move is straight in joint space; where that is
     blocked, it goes through other poses, home, or points `via` (k, n).  With
     `motion.both_directions` each pose is measured twice, inside `limits` (lower, upper).  Solve,
-    check the moves of the solution, forbid the blocked ones, and again: at the end all moves are
-    checked, and the tour is one that the search holds best at costs that are nowhere above the true
-    ones.  With an `alias` the order is one in which a drift does little to what the plan is for, as
+    check the moves of the solution, forbid the blocked ones, and again, until all are checked: no
+    cost was above the true one.  With an `alias` a drift does little to what the plan is for, as
     far as `motion.extra_time` and `motion.load_changes` allow.  A pose that no free move reaches is
     Unreachable."""
     forces = np.zeros((1, 3)) if loads is None else loads

@@ -39,7 +39,7 @@ from elastocal.planning.collision import (
 from elastocal.units import Array, BoolArray, IntArray
 
 SAME = 1e-9  # rounding of a joint value that was set to its limit
-SHOWN = 3  # causes that a remedy names
+SHOWN = 3  # causes or poses that a remedy names
 ADVICE = {
     "struck": "; strike fewer poses",
     "mounting_plane": (
@@ -554,11 +554,8 @@ class Roadmap:
         return f" (in the way: {', '.join(names)})" if names else ""
 
 
-MOST_NAMED = 3
-
-
 class Unreachable(InsufficientDataError):
-    """Some poses of a plan cannot be reached: `poses` are their indices."""
+    """No move reaches some poses of a plan, `poses`, from home or from most others."""
 
     def __init__(self, message: str, *poses: int) -> None:
         super().__init__(message)
@@ -693,9 +690,8 @@ class Moves:
         return not all([roadmap.check(wanted[roadmap.loaded]) for roadmap in self.maps])
 
     def settle(self) -> None:
-        """Check the ways between all visits: many at once take less time than a few again and
-        again, 75 s of CPU instead of 270 for 30 poses where nine of ten moves are blocked under the
-        load (experiment_design/kr270_plan/crowded.toml)."""
+        """Check the ways between all visits: many at once take a quarter of the CPU of a few again
+        and again (experiment_design/kr270_plan/crowded.toml)."""
         for roadmap in self.maps:
             here = self.loaded[self.load] | (not roadmap.loaded)
             home = [] if self.home is None or roadmap.loaded else [self.home]
@@ -727,15 +723,14 @@ class Moves:
                 needed.insert(0, self.home)
             if len(needed) < 2:
                 continue
-            most, *lost = roadmap.parts(needed)
-            if lost:
-                every = [point for part in lost for point in part]
-                # Where most hang together, all others are told at once.
-                clear = len(most) > len(every) and self.home not in every
-                raise self._unreachable(roadmap, every if clear else lost[0])
+            parts = roadmap.parts(needed)
+            stay = next((part for part in parts if self.home in part), parts[0])
+            if len(parts) > 1:
+                raise self._unreachable(roadmap, stay, np.setdiff1d(needed, stay).tolist())
 
-    def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
-        named = some((roadmap.name(point, self.home) for point in lost), MOST_NAMED)
+    def _unreachable(self, roadmap: Roadmap, stay: list[int], away: list[int]) -> Unreachable:
+        lost = stay if stay == [self.home] else away
+        named = some((roadmap.name(point, self.home) for point in lost), SHOWN)
         others = np.setdiff1d(np.arange(len(self.points)), lost)
         between = roadmap.times[lost][:, others]
         i, j = np.unravel_index(int(np.argmin(between)), between.shape)
@@ -744,7 +739,7 @@ class Moves:
             f"{named} cannot be reached{roadmap.carrying} by collision-free joint moves, "
             f"neither directly nor through home and other poses{by}; give another home in "
             "[design.motion], free the way, or narrow [limits] to exclude such poses",
-            *np.unique(self.pose[np.isin(self.leave, lost)]),
+            *np.unique(self.pose[np.isin(self.leave, away)]),
         )
 
 

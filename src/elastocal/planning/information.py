@@ -285,9 +285,11 @@ class Estimable:
         return (self._shown_by_none(unseen),) if unseen else ()
 
     def _shown_by_none(self, names: list[str]) -> str:
-        loads = self.model.cell.design.loads
-        loaded, remedy = loads is not None and loads.any(), "state a load ([design] loads_N)"
-        remedy = "change the load's direction or the limits" if loaded else remedy
+        cell, remedy = self.model.cell, "add a marker elsewhere"
+        if any("load" in effect_of(p.effect).needed(cell) for p in self.model.parameters):
+            loaded = cell.design.loads is not None and cell.design.loads.any()
+            remedy = "change the load's direction or the limits"
+            remedy = remedy if loaded else "state a load ([design] loads_N)"
         they_move, them = ("it moves", "it") if len(names) == 1 else ("they move", "them")
         return (
             f"no feasible pose shows {listed(names)}: {they_move} no marker in any of them; "

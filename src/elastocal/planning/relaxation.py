@@ -7,14 +7,14 @@ first derivatives until none of them gains (column generation).  With the tangen
 
 for all weights 0 ≤ w'_i ≤ 1 with Σ_{i∈l} w'_i = n_l, exact plans among them; the maximum is
 taken greedily.  Sources: Pukelsheim, Optimal Design of Experiments (2006), ch. 5 and 7; Harman,
-Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348.
-"""
+Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 
 import numpy as np
 
@@ -39,8 +39,7 @@ class DesignProblem:
 
     `blocks` (N, r, p): whitened, scaled B of each candidate; M(w) = prior + Σ_i w_i B_iᵀB_i with
     `prior` (p, p) from what is known and measured already.  `group` (N,) in 0 … L−1, `shares` (L,).
-    `source`: the cell's file, as messages begin.
-    """
+    `source`: the cell's file, as messages begin."""
 
     blocks: Array
     prior: Array
@@ -118,21 +117,27 @@ class DesignProblem:
         n = int(self.shares.sum())
         # How many combinations of parameters the prior determines.
         known = int(np.linalg.matrix_rank(self.prior, hermitian=True))
-        needed = -(-(p - known) // r)
-        if n < needed:
+        if n * r + known < p:
             prior = f" and the prior {known}" if known else ""
-            raise InsufficientDataError(
-                f"{self.source}fewer equations than parameters: {n} pose{'s' * (n != 1)} of {r} "
-                f"readings give {n * r}{prior}, for {p} parameters; plan at least {needed} poses, "
-                "switch effects off or state a prior"
+            raise self._too_few(
+                f"fewer equations than parameters: {n} pose{'s' * (n != 1)} of {r} readings give "
+                f"{n * r}{prior}, for {p} parameters"
             )
 
     def check_determined(self, value: float) -> None:
         if not np.isfinite(value):
-            raise InsufficientDataError(
-                f"no plan of {self.shares.sum()} poses that determines all {len(self.prior)} "
-                "parameters was found; plan more poses, other shares, or state a prior"
-            )
+            n, p = self.shares.sum(), len(self.prior)
+            raise self._too_few(f"no plan of {n} poses found determines all {p} parameters")
+
+    def _too_few(self, told: str) -> InsufficientDataError:
+        """With how many poses drawn at random determine all: readings of several markers on one
+        body are fewer equations than numbers."""
+        drawn = self.blocks[np.random.default_rng(0).permutation(len(self.blocks))]
+        sums = enumerate(accumulate((B.T @ B for B in drawn), initial=self.prior))
+        n = next((n for n, M in sums if n > self.shares.sum() and covariance(M)[1]), None)
+        more = "more" if n is None else f"at least {n}"
+        remedy = f"plan {more} poses, switch effects off or state a prior"
+        return InsufficientDataError(f"{self.source}{told}; {remedy}")
 
     def random(self, rng: np.random.Generator) -> IntArray:
         """A plan (n,), sorted, drawn uniformly from those of the shares."""

@@ -133,10 +133,14 @@ class Searches:
     setup: Setup
     space: JointSpace
     checker: Feasibility
+    reached: Callable[[Array], BoolArray] | None = None  # by moves, once that is asked
     _rows: dict[int, tuple[ca.Function, ca.Function]] = field(default_factory=dict)
 
     def feasible(self, q: Array) -> BoolArray:
-        return self.checker.under(q, self.setup.information.forces).ok
+        ok = self.checker.under(q, self.setup.information.forces).ok
+        if self.reached is not None:
+            ok[ok] = self.reached(q[ok])
+        return ok
 
     def rows(self, q: Array, level: int) -> tuple[ca.Function, ca.Function]:
         if level not in self._rows:
@@ -538,14 +542,14 @@ def ordered(search: Search) -> tuple[Execution, Alias | None, list[str]]:
     if not order.gone:
         return execution, alias, []
     if search.effort.starts:
+        search.searches.reached = order.reached
         chosen = search.polished(search.chosen, "replaced")
         with suppress(Unreachable):
             if search.value_of(chosen) < search.value:
                 execution, alias = order.put(chosen)
                 search.exchange(chosen)
-    told = f"{order.gone} better poses were left out: no free move reaches them"
-    one = "one better pose was left out: no free move reaches it"
-    return execution, alias, [one if order.gone == 1 else told]
+    told = f"no free move reaches some better poses, which were left out: {order.gone}"
+    return execution, alias, [f"{told}; the certificate's bound counts such poses"]
 
 
 class _Ordering:
@@ -563,10 +567,7 @@ class _Ordering:
             try:
                 return self.put(self.search.chosen)
             except Unreachable as error:
-                if k == 0:
-                    self._unwind()
-                else:
-                    self._replace(error)
+                self._replace(error) if k else self._unwind()
         return self.put(self.search.chosen)
 
     def put(self, chosen: IntArray) -> tuple[Execution, Alias | None]:
@@ -621,7 +622,7 @@ class _Ordering:
                 best_of(worth[new], problem.group[new], np.full(len(problem.shares), LIKELY))
             ]
             new = np.setdiff1d(new, tried)
-            left = np.union1d(left, tried[self._reached(pool.q[tried])])
+            left = np.union1d(left, tried[self.reached(pool.q[tried])])
             part = problem.restricted(left)
             if (np.bincount(part.group, minlength=len(problem.shares)) < problem.shares).any():
                 continue
@@ -640,7 +641,7 @@ class _Ordering:
         parts = roadmap.parts(list(range(len(points))))
         return points[parts[0] if motion.home is None else next(p for p in parts if 0 in p)]
 
-    def _reached(self, q: Array) -> BoolArray:
+    def reached(self, q: Array) -> BoolArray:
         next_to = np.argsort(np.abs(q[:, None] - self.hub).max(axis=2), axis=1)
         alone = np.arange(len(q))
         for k in range(min(TRIED, len(self.hub))):
