@@ -355,9 +355,9 @@ def checked_arguments(function: F) -> F:
 
 
 def sealed(result: Any) -> Any:
-    """A result whose arrays, and those of the calibrated arm in it, nobody can write into: what it
-    says of itself, and what follows from it, would no longer be what was found."""
-    if isinstance(result, Saved) and type(result).__name__ != "Measurements":
+    """A result whose arrays, and those of what it is made of, nobody can write into: what it says
+    of itself, and what follows from it, would no longer be what was found."""
+    if is_dataclass(result) and type(result).__name__ not in ("Measurements", "Model", "Cell"):
         import numpy as np
 
         for name, value in vars(result).items():
@@ -382,7 +382,7 @@ def kinds_of(annotation: str) -> list[str]:
 
 
 def shown(value: Any) -> str:
-    if value is None or isinstance(value, str | Real | list | tuple | Mapping):
+    if value is None or isinstance(value, str | Real | list | tuple | dict):
         return quoted(value)
     shape = getattr(value, "shape", ())
     return f"{type(value).__name__}{f' of shape {shape}' if shape else ''}"

@@ -160,6 +160,16 @@ def _check_path(path: str | Path) -> None:
         raise InputError(f"{str(path)!r}: no file can have this name; check the path")
 
 
+def apart(outputs: Iterable[str | Path], inputs: Iterable[str | Path]) -> None:
+    # Not Path.resolve, which raises RuntimeError where links go round in a circle.
+    read, taken = {*map(os.path.realpath, inputs)}, set[str]()
+    for path in outputs:
+        real = os.path.realpath(path)
+        require(real not in read, f"{path} is read and would be written over; name another output")
+        require(real not in taken, f"{path}: two outputs of the same name; name another one")
+        taken.add(real)
+
+
 def check_output(path: str | Path, endings: Collection[str] = ()) -> None:
     """Raise InputError where no file can be written under `path`, or its ending is that of
     something else; a name without one may stand for anything."""
@@ -306,7 +316,8 @@ def load_plugins(
     `fresh` for a file that has changed.  `asked`: whether the user said that they may run, as the
     environment variable TRUSTED says of folders."""
     load_installed()
-    owner = cell or Path("plug-ins")
+    owner, said = cell or Path("plug-ins"), option("plugins", True)
+    said = said if said.startswith("--") else f"ec.Model(..., {said})"
     for k, name in enumerate(modules):
         if _has_run(name, fresh):
             continue
@@ -315,7 +326,7 @@ def load_plugins(
         require(
             asked or _trusted(owner),
             f"{key} names {what}, which runs with your rights and so not unasked; "
-            f"read it, then say {option('plugins', True)}, or set {TRUSTED}="
+            f"read it, then say {said}, or set {TRUSTED}="
             f"{owner.absolute().parent} for all cells of this folder",
         )
         if is_plugin_file(name):

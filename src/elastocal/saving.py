@@ -20,7 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from elastocal.above import checked_arguments
-from elastocal.files import atomic_write, read_json
+from elastocal.cell import files_of
+from elastocal.files import apart, atomic_write, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.messages import (
     ElastocalError,
@@ -59,7 +60,25 @@ def save(result: Any, path: str | Path, **how: Any) -> None:
     write = by_ending.get(path.suffix.lower() or next(iter(by_ending)), by_ending.get(ANY))
     if write is None:
         raise InputError(f"{path}: {kind} is saved as {' or '.join(by_ending)}; name the file so")
+    if kind != "Measurements":  # which may take the place of their file
+        model = getattr(getattr(result, "old", result), "model", None)
+        outputs = [p for p in (path, how.get("joint_correction")) if isinstance(p, str | Path)]
+        apart(outputs, sources(result) + ([] if model is None else files_of(model.cell)))
     write(result, path, **how)
+
+
+def sources(result: Any) -> list[Path]:
+    of_kind: dict[str, Callable[[Any], list[Any]]] = {
+        "Comparison": lambda c: [c.old.model.cell.path, c.old.source, c.new.source],
+        "Compensation": lambda c: [c.targets.table.source],
+        "Calibration": lambda c: [c.model.cell.path, c.observations.table.source],
+        "Diagnosis": lambda d: [d.model.cell.path, d.data],
+        "CalibratedArm": lambda arm: [arm.model.cell.path, arm.source],
+        "Plan": lambda p: [p.model.cell.path],
+        "Measurements": lambda table: [table.source],
+    }
+    named = of_kind.get(type(result).__name__, lambda r: [])(result)
+    return [Path(path) for path in named if path is not None and Path(path).is_file()]
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -116,10 +135,6 @@ def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
             f"{path}: the model diagnosed is not that of a cell file, which what was found could "
             "join; write the cell as a file (TOML), and diagnose that"
         )
-    require(
-        path.resolve() != cell.path.resolve(),
-        f"{path} is the cell that was diagnosed; write the cell found to another file",
-    )
     extra = (*diagnosis.effects, *diagnosis.slight, *diagnosis.fields)
     return write_extended_cell(cell.path, path, extra, diagnosis.model_keys)
 
@@ -134,12 +149,15 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
     atomic_write(path, commands_csv(found))
 
 
-def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
+@checked_arguments
+def save_arm(
+    arm: CalibratedArm, path: Path, joint_correction: str | Path | None = None, **how: Any
+) -> None:
     """`how` as for `Wish`."""
     from elastocal.export.export import Wish, export, write
 
-    correction = how.pop("joint_correction", None)
-    write(export(arm, Wish(path, **how, correct_joints=correction is not None)), path, correction)
+    wish = Wish(path, **how, correct_joints=joint_correction is not None)
+    write(export(arm, wish), path, joint_correction)
 
 
 def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:

@@ -197,9 +197,9 @@ def _task_hash(digest: str, seed: int, index: int, values: Row) -> str:
     return _hash(digest, seed, index, json.dumps(values, sort_keys=True))
 
 
-def _json(where: str, value: Any) -> str:
+def _json(where: str, value: Any) -> bytes:
     try:
-        return json.dumps(value, allow_nan=False)
+        return json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
     except (TypeError, ValueError) as error:
         told = "finite numbers, text, true/false, lists and tables of them"
         raise InputError(f"{where}: {error}; use plain JSON values: {told}") from None
@@ -272,8 +272,10 @@ def execute(sources: Sources, task: Row) -> Row:
             raise RuntimeError(f"{told} {sources.version}; install the same there")
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
         line = line_of(task, rows=_checked_rows(found, sources.stated.columns, task["values"]))
-    except (Exception, SystemExit) as error:
-        told = " ".join([f"{type(error).__name__}:", *str(error).split()])
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        told = messages.printable(" ".join([f"{type(error).__name__}:", *str(error).split()]))
         line = line_of(task, told, trace=traceback.format_exc())
     return line | {"task_seconds": time.perf_counter() - begun}
 
@@ -302,6 +304,8 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     kind, takes = KINDS.get(unit, (float, "a number"))
     if type(value) is int and kind is float:
         value = float(value)
+    if kind is str:
+        _json(f"column {name!r}", value)  # no half of a letter, as in a file's name
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
     if isinstance(value, float) and not math.isfinite(value):

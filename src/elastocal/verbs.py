@@ -357,7 +357,7 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats)
-    if isinstance(plan, str | Path) or hasattr(plan, "to_csv"):
+    if isinstance(plan, str | Path) or hasattr(plan, "iterrows"):
         poses = made.read_plan(plan)
     elif type(plan).__name__ == "Plan":
         poses = plan.table()
@@ -645,7 +645,7 @@ def _targets(
 
     if isinstance(targets, Targets):
         return targets
-    if isinstance(targets, str | Path) or hasattr(targets, "to_csv"):
+    if isinstance(targets, str | Path) or hasattr(targets, "iterrows"):
         return read_targets(targets, kinds, frame, force)
     found = np.asarray(targets, dtype=float)
     if found.shape in ((3,), (4, 4)):

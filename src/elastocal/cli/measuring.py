@@ -17,7 +17,6 @@ from elastocal.cli.app import (
     Asked,
     Run,
     command,
-    files_of,
     named_numbers,
     repeated,
     whole_numbers,
@@ -169,6 +168,7 @@ def design(
         picture: Picture of the poses to write (PNG, SVG).
         cell_out: Cell file to write, with what [design.choose] has chosen.
     """
+    from elastocal.cell import files_of
     from elastocal.files import atomic_write
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.poses import plan_and_names

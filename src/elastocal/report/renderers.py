@@ -37,6 +37,7 @@ from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import cell_meaning, check_known, listed, option, printable, quoted, require
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
+from elastocal.saving import sources
 from elastocal.screen import safe_console, shown
 
 if TYPE_CHECKING:
@@ -364,23 +365,11 @@ def plotly() -> tuple[str, str]:
     return source, base64.b64encode(gzip.compress(source.encode(), 9, mtime=0)).decode()
 
 
-def sources(result: Any) -> list[Path]:
-    of_kind: dict[str, Callable[[Any], list[Any]]] = {
-        "Comparison": lambda c: [c.old.model.cell.path, c.old.source, c.new.source],
-        "Compensation": lambda c: [c.targets.table.source],
-        "Calibration": lambda c: [c.model.cell.path, c.observations.table.source],
-        "Diagnosis": lambda d: [d.model.cell.path, d.data],
-        "Plan": lambda p: [p.model.cell.path],
-        "Measurements": lambda table: [table.source],
-    }
-    named = of_kind.get(type(result).__name__, lambda r: [])(result)
-    return [Path(path) for path in named if path is not None and Path(path).is_file()]
-
-
 def digests_of(inputs: Inputs) -> dict[str, str]:
     if inputs is None or isinstance(inputs, Mapping):
         return dict(inputs or {})
     found = {}
+    require(isinstance(inputs, Iterable), f"{option('inputs')} takes paths; found {inputs}")
     for path in [inputs] if isinstance(inputs, str | Path) else inputs:
         with open_input(path, "input file") as handle:
             found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
