@@ -20,6 +20,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from numbers import Integral, Real
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ForwardRef, TypeVar
 
@@ -368,6 +369,21 @@ def sealed(result: Any) -> Any:
             else:
                 sealed(value)
     return result
+
+
+# The files that a result came from.
+SOURCES = {
+    "Comparison": "old.model.cell.path old.source new.source", "Plan": "model.cell.path",
+    "Compensation": "targets.table.source", "Measurements": "source",
+    "Calibration": "model.cell.path observations.table.source",
+    "CalibratedArm": "model.cell.path source", "Diagnosis": "model.cell.path data",
+}  # fmt: skip
+
+
+def sources(result: Any) -> list[Path]:
+    named = SOURCES.get(type(result).__name__, "").split()
+    found = [path for path in (attrgetter(name)(result) for name in named) if path is not None]
+    return [Path(path) for path in found if Path(path).is_file()]
 
 
 def kinds_of(annotation: str) -> list[str]:

@@ -131,6 +131,14 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
         raise InputError(f"{path}: lists within lists without end; {remedy}") from None
 
 
+def read_record(path: Path, max_bytes: int = 200_000_000) -> dict[str, Any]:
+    """What a command wrote of its run; empty where that is damaged or not there."""
+    with suppress(InputError):
+        if isinstance(found := read_json(path, "record", max_bytes, ""), dict):
+            return found
+    return {}
+
+
 def decoded(
     source: str, data: bytes, remedy: str, codec: str = "utf-8-sig", name: str = "UTF-8",
     line: int = 1,

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from elastocal.above import checked_arguments
+from elastocal.above import checked_arguments, sources
 from elastocal.cell import files_of
-from elastocal.files import apart, atomic_write, read_json
+from elastocal.files import apart, atomic_write, read_record
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.messages import (
     ElastocalError,
@@ -47,8 +47,6 @@ if TYPE_CHECKING:
     from elastocal.planning.execution import Execution
     from elastocal.planning.plan import Plan
 
-LARGEST_SUMMARY = 200_000_000  # bytes
-
 # One verb's result should not load another verb: each function imports what it needs.
 
 
@@ -65,20 +63,6 @@ def save(result: Any, path: str | Path, **how: Any) -> None:
         outputs = [p for p in (path, how.get("joint_correction")) if isinstance(p, str | Path)]
         apart(outputs, sources(result) + ([] if model is None else files_of(model.cell)))
     write(result, path, **how)
-
-
-def sources(result: Any) -> list[Path]:
-    of_kind: dict[str, Callable[[Any], list[Any]]] = {
-        "Comparison": lambda c: [c.old.model.cell.path, c.old.source, c.new.source],
-        "Compensation": lambda c: [c.targets.table.source],
-        "Calibration": lambda c: [c.model.cell.path, c.observations.table.source],
-        "Diagnosis": lambda d: [d.model.cell.path, d.data],
-        "CalibratedArm": lambda arm: [arm.model.cell.path, arm.source],
-        "Plan": lambda p: [p.model.cell.path],
-        "Measurements": lambda table: [table.source],
-    }
-    named = of_kind.get(type(result).__name__, lambda r: [])(result)
-    return [Path(path) for path in named if path is not None and Path(path).is_file()]
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -99,12 +83,8 @@ def beside(path: Path) -> Path:
     require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
     summary = path.with_suffix(".json")
     if summary.exists():
-        try:
-            found = read_json(summary, "summary", LARGEST_SUMMARY, "")
-        except InputError:
-            found = None
         require(
-            isinstance(found, dict) and str(found.get("schema")).startswith("elastocal/"),
+            str(read_record(summary).get("schema")).startswith("elastocal/"),
             f"{summary}: goes beside {path} and would be written over, but elastocal did not "
             "write it; move it, or name the plan otherwise",
         )

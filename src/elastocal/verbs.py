@@ -607,6 +607,7 @@ def compensate(
     """
     import numpy as np
 
+    from elastocal.compensation import check_frame
     from elastocal.compensation import compensate as run
     from elastocal.model.calibrated import CalibratedArm, tool_point
     from elastocal.model.effects.base import given_force
@@ -629,13 +630,6 @@ def compensate(
     return run(arm, wanted, where, start, cast(int, seed), progress or _silent)
 
 
-def check_frame(frame: str) -> None:
-    from elastocal.compensation import FRAMES
-
-    told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
-    require(frame in FRAMES, told)
-
-
 def _targets(
     targets: Any, kinds: tuple[str, ...], frame: Literal["base", "tracker"], force: Array | None
 ) -> Targets:
@@ -651,8 +645,7 @@ def _targets(
     if found.shape in ((3,), (4, 4)):
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
-    placed = oriented or (found.ndim == 2 and found.shape[1] == 3)
-    right = placed and len(found) > 0
+    right = (oriented or (found.ndim == 2 and found.shape[1] == 3)) and len(found) > 0
     told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found"
     require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
     if oriented:

@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from elastocal import verbs
-from elastocal.cli.app import (
-    PAGES,
-    Asked,
-    Run,
-    command,
-    named_numbers,
-    repeated,
-    whole_numbers,
-)
+from elastocal.cli.app import PAGES, Asked, Run, command, named_numbers, repeated, whole_numbers
 from elastocal.messages import InputError, counted, listed, require, said_of
 from elastocal.screen import interrupts, say
 

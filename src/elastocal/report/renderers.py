@@ -31,13 +31,12 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal import __version__
-from elastocal.above import checked_arguments
+from elastocal.above import checked_arguments, sources
 from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import cell_meaning, check_known, listed, option, printable, quoted, require
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
-from elastocal.saving import sources
 from elastocal.screen import safe_console, shown
 
 if TYPE_CHECKING:
@@ -103,7 +102,7 @@ def print_blocks(console: Console, blocks: Iterable[say.Block], details: bool = 
             if heading and _needs(heading, block):
                 console.print(Text(heading, style="bold underline"))
             for each in shown:
-                console.print(each)
+                console.print(each, crop=False)  # wider than the screen, rather than cut
             heading, before = "", kind
 
 
@@ -151,10 +150,10 @@ def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
         words, cells = k in shown.words, [row[k] for row in shown.rows]
         longest = max((len(w) for text in (head, *cells) for w in text.split()), default=0)
         longest = longest if words else max([longest, *map(len, cells)])
-        whole = words and longest <= LONGEST_WHOLE and (not k or head in ("unit", ""))
+        held = words and longest <= LONGEST_WHOLE and (not k or "±" in head or head in ("unit", ""))
         gives_way = words and any(" " in cell for cell in cells)
         table.add_column(head, justify="left" if words else "right", overflow="fold",
-                         min_width=longest if whole else None,
+                         min_width=longest if held else None,
                          width=longest if tight and not gives_way else None)  # fmt: skip
     for row in shown.rows:
         table.add_row(*(Text(printable(cell), STYLES.get(cell, "")) for cell in row))
