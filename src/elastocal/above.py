@@ -108,7 +108,7 @@ class Saved(ByValue):
                 `elastocal export` has them.
 
         Raises:
-            InputError: The file cannot be written, or the result not under this ending.
+            InputError: The file cannot be written, the result came from it, or is not of its kind.
 
         Examples:
             >>> arm = ec.identify("cell.toml", "data.csv").arm
