@@ -216,9 +216,9 @@ def test_compensate_is_that_of_the_command_line(fit):
     commands = ec.compensate(fit, "targets.csv", load=LOAD)
     commands.save("front.csv")
     assert Path("front.csv").read_text() == Path("line.csv").read_text()
-    in_memory = ec.compensate(fit.arm, TARGETS, load=LOAD)
+    in_memory, one = (ec.compensate(fit, t, load=LOAD) for t in (TARGETS, pd.Series(TARGETS[0])))
     np.testing.assert_allclose(in_memory.q, commands.q, atol=1e-12)
-    assert len(in_memory) == 3 and in_memory.reached.all()
+    assert len(in_memory) == 3 and in_memory.reached.all() and one.reached.all()
     frame = pd.read_csv("targets.csv")[["z_mm", "x_mm", "y_mm"]]  # columns count by their names
     np.testing.assert_array_equal(ec.compensate(fit.arm, frame, load=LOAD).q, commands.q)
 
