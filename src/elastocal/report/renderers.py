@@ -148,12 +148,12 @@ def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
                       box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)  # fmt: skip
     for k, head in enumerate(shown.heads):
         words, cells = k in shown.words, [row[k] for row in shown.rows]
-        longest = max((len(w) for text in (head, *cells) for w in text.split()), default=0)
-        longest = longest if words else max([longest, *map(len, cells)])
+        word = max((len(w) for text in (head, *cells) for w in text.split()), default=0)
+        longest = word if words else max([word, *map(len, cells)])
         held = words and longest <= LONGEST_WHOLE and (not k or "±" in head or head in ("unit", ""))
         gives_way = words and any(" " in cell for cell in cells)
         table.add_column(head, justify="left" if words else "right", overflow="fold",
-                         min_width=longest if held else None,
+                         min_width=word if held or not words else None,
                          width=longest if tight and not gives_way else None)  # fmt: skip
     for row in shown.rows:
         table.add_row(*(Text(printable(cell), STYLES.get(cell, "")) for cell in row))
