@@ -356,16 +356,15 @@ def checked_arguments(function: F) -> F:
 
 
 def sealed(result: Any) -> Any:
-    """A result whose arrays, and those of what it is made of, nobody can write into: what it says
-    of itself, and what follows from it, would no longer be what was found."""
-    if is_dataclass(result) and type(result).__name__ not in ("Measurements", "Model", "Cell"):
+    """A result whose arrays, and those of arm and covariance in it, nobody can write into: what it
+    says of itself, and what follows from it, would no longer be what was found."""
+    kind = type(result).__name__
+    if kind == "Covariance" or (isinstance(result, Saved) and kind != "Measurements"):
         import numpy as np
 
         for name, value in vars(result).items():
             if isinstance(value, np.ndarray):
-                view = value.view()
-                view.flags.writeable = False
-                object.__setattr__(result, name, view)
+                object.__setattr__(result, name, np.broadcast_to(value, value.shape))
             else:
                 sealed(value)
     return result
