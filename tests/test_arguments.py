@@ -135,7 +135,7 @@ def test_what_the_caller_does_to_its_array_later_is_its_own(model: ec.Model) -> 
 
 
 def test_nobody_writes_into_a_result(fit: ec.Calibration, model: ec.Model) -> None:
-    for values in (fit.x, fit.arm.x, fit.residual, ec.compare(fit, fit, poses=3).moved):
+    for values in (fit.x, fit.arm.x, fit.covariance, ec.compare(fit, fit, poses=3).moved):
         before = values.copy()
         with pytest.raises(ValueError, match="read-only"):
             values[...] = 0.0

@@ -20,6 +20,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
 from numbers import Integral, Real
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ForwardRef, TypeVar
 
@@ -107,7 +108,7 @@ class Saved(ByValue):
                 `elastocal export` has them.
 
         Raises:
-            InputError: The file cannot be written, or the result not under this ending.
+            InputError: The file cannot be written, the result came from it, or is not of its kind.
 
         Examples:
             >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -355,19 +356,33 @@ def checked_arguments(function: F) -> F:
 
 
 def sealed(result: Any) -> Any:
-    """A result whose arrays, and those of the calibrated arm in it, nobody can write into: what it
+    """A result whose arrays, and those of arm and covariance in it, nobody can write into: what it
     says of itself, and what follows from it, would no longer be what was found."""
-    if isinstance(result, Saved) and type(result).__name__ != "Measurements":
+    kind = type(result).__name__
+    if kind == "Covariance" or (isinstance(result, Saved) and kind != "Measurements"):
         import numpy as np
 
         for name, value in vars(result).items():
             if isinstance(value, np.ndarray):
-                view = value.view()
-                view.flags.writeable = False
-                object.__setattr__(result, name, view)
+                object.__setattr__(result, name, np.broadcast_to(value, value.shape))
             else:
                 sealed(value)
     return result
+
+
+# The files that a result came from.
+SOURCES = {
+    "Comparison": "old.model.cell.path old.source new.source", "Plan": "model.cell.path",
+    "Compensation": "targets.table.source", "Measurements": "source",
+    "Calibration": "model.cell.path observations.table.source",
+    "CalibratedArm": "model.cell.path source", "Diagnosis": "model.cell.path data",
+}  # fmt: skip
+
+
+def sources(result: Any) -> list[Path]:
+    named = SOURCES.get(type(result).__name__, "").split()
+    found = [path for path in (attrgetter(name)(result) for name in named) if path is not None]
+    return [Path(path) for path in found if Path(path).is_file()]
 
 
 def kinds_of(annotation: str) -> list[str]:
@@ -382,7 +397,7 @@ def kinds_of(annotation: str) -> list[str]:
 
 
 def shown(value: Any) -> str:
-    if value is None or isinstance(value, str | Real | list | tuple | Mapping):
+    if value is None or isinstance(value, str | Real | list | tuple | dict):
         return quoted(value)
     shape = getattr(value, "shape", ())
     return f"{type(value).__name__}{f' of shape {shape}' if shape else ''}"

@@ -449,3 +449,13 @@ class Cell(Record):
 
 
 read_cell = Cell.read
+
+
+def files_of(cell: Cell) -> list[Path]:
+    robot, targets = cell.robot, cell.design.test_path
+    solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
+    path = None if targets is None else targets.file
+    named = [robot.urdf, robot.mjcf, robot.dh, robot.masses, cell.design.taught, path]
+    named += [solid.mesh for solid in solids]
+    named += [Path(name) for name in cell.plugins if is_plugin_file(name)]
+    return [path for path in named if path is not None]

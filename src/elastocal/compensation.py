@@ -31,6 +31,11 @@ Frame = Literal["base", "tracker"]
 FRAMES: tuple[Frame, ...] = ("base", "tracker")
 
 
+def check_frame(frame: str) -> None:
+    told = f"takes {' or '.join(FRAMES)}; found {messages.quoted(frame)}"
+    require(frame in FRAMES, f"{option('frame')} {told}")
+
+
 @dataclass(frozen=True)
 class Targets:
     """n targets; `table` holds their force (n, 3) N and circumstances, one row each.  `position`

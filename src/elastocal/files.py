@@ -131,6 +131,14 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
         raise InputError(f"{path}: lists within lists without end; {remedy}") from None
 
 
+def read_record(path: Path, max_bytes: int = 200_000_000) -> dict[str, Any]:
+    """What a command wrote of its run; empty where that is damaged or not there."""
+    with suppress(InputError):
+        if isinstance(found := read_json(path, "record", max_bytes, ""), dict):
+            return found
+    return {}
+
+
 def decoded(
     source: str, data: bytes, remedy: str, codec: str = "utf-8-sig", name: str = "UTF-8",
     line: int = 1,
@@ -158,6 +166,16 @@ def check_exists(path: Path, key: str) -> Path:
 def _check_path(path: str | Path) -> None:
     if "\0" in str(path):
         raise InputError(f"{str(path)!r}: no file can have this name; check the path")
+
+
+def apart(outputs: Iterable[str | Path], inputs: Iterable[str | Path]) -> None:
+    # Not Path.resolve, which raises RuntimeError where links go round in a circle.
+    read, taken = {*map(os.path.realpath, inputs)}, set[str]()
+    for path in outputs:
+        real = os.path.realpath(path)
+        require(real not in read, f"{path} is read and would be written over; name another output")
+        require(real not in taken, f"{path}: two outputs of the same name; name another one")
+        taken.add(real)
 
 
 def check_output(path: str | Path, endings: Collection[str] = ()) -> None:
@@ -306,7 +324,8 @@ def load_plugins(
     `fresh` for a file that has changed.  `asked`: whether the user said that they may run, as the
     environment variable TRUSTED says of folders."""
     load_installed()
-    owner = cell or Path("plug-ins")
+    owner, said = cell or Path("plug-ins"), option("plugins", True)
+    said = said if said.startswith("--") else f"ec.Model(..., {said})"
     for k, name in enumerate(modules):
         if _has_run(name, fresh):
             continue
@@ -315,7 +334,7 @@ def load_plugins(
         require(
             asked or _trusted(owner),
             f"{key} names {what}, which runs with your rights and so not unasked; "
-            f"read it, then say {option('plugins', True)}, or set {TRUSTED}="
+            f"read it, then say {said}, or set {TRUSTED}="
             f"{owner.absolute().parent} for all cells of this folder",
         )
         if is_plugin_file(name):

@@ -21,8 +21,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from elastocal import files
 from elastocal.cell import Cell
+from elastocal.files import REGISTERED, load_plugins
 from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
 from elastocal.messages import InputError
@@ -68,8 +68,6 @@ __all__ = [
 
 # What the relaxation needs of a criterion, it states itself, as a function of the covariance.
 Term, TraceTerm, SpectralTerm = ScenarioCriterion, TraceCriterion, SpectralCriterion
-
-load_plugins = files.load_plugins
 
 E = TypeVar("E", bound=Effect)
 N = TypeVar("N", bound=NoiseModel)
@@ -177,7 +175,7 @@ def register_criterion(criterion: C) -> C:
 def _registered(register: Callable[[T], Any], what: T) -> T:
     try:
         register(what)
-        files.REGISTERED.add(what if isinstance(what, type) else type(what))
+        REGISTERED.add(what if isinstance(what, type) else type(what))
         return what
     except InputError as error:
         caller = sys._getframe(2)

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
-from elastocal.above import checked_arguments
-from elastocal.files import atomic_write, read_json
+from elastocal.above import checked_arguments, sources
+from elastocal.cell import files_of
+from elastocal.files import apart, atomic_write, read_record
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.messages import (
     ElastocalError,
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
     from elastocal.planning.execution import Execution
     from elastocal.planning.plan import Plan
 
-LARGEST_SUMMARY = 200_000_000  # bytes
-
 # One verb's result should not load another verb: each function imports what it needs.
 
 
@@ -59,6 +58,10 @@ def save(result: Any, path: str | Path, **how: Any) -> None:
     write = by_ending.get(path.suffix.lower() or next(iter(by_ending)), by_ending.get(ANY))
     if write is None:
         raise InputError(f"{path}: {kind} is saved as {' or '.join(by_ending)}; name the file so")
+    if kind != "Measurements":  # which may take the place of their file
+        model = getattr(getattr(result, "old", result), "model", None)
+        outputs = [p for p in (path, how.get("joint_correction")) if isinstance(p, str | Path)]
+        apart(outputs, sources(result) + ([] if model is None else files_of(model.cell)))
     write(result, path, **how)
 
 
@@ -80,12 +83,8 @@ def beside(path: Path) -> Path:
     require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
     summary = path.with_suffix(".json")
     if summary.exists():
-        try:
-            found = read_json(summary, "summary", LARGEST_SUMMARY, "")
-        except InputError:
-            found = None
         require(
-            isinstance(found, dict) and str(found.get("schema")).startswith("elastocal/"),
+            str(read_record(summary).get("schema")).startswith("elastocal/"),
             f"{summary}: goes beside {path} and would be written over, but elastocal did not "
             "write it; move it, or name the plan otherwise",
         )
@@ -116,10 +115,6 @@ def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
             f"{path}: the model diagnosed is not that of a cell file, which what was found could "
             "join; write the cell as a file (TOML), and diagnose that"
         )
-    require(
-        path.resolve() != cell.path.resolve(),
-        f"{path} is the cell that was diagnosed; write the cell found to another file",
-    )
     extra = (*diagnosis.effects, *diagnosis.slight, *diagnosis.fields)
     return write_extended_cell(cell.path, path, extra, diagnosis.model_keys)
 
@@ -134,12 +129,15 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
     atomic_write(path, commands_csv(found))
 
 
-def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
+@checked_arguments
+def save_arm(
+    arm: CalibratedArm, path: Path, joint_correction: str | Path | None = None, **how: Any
+) -> None:
     """`how` as for `Wish`."""
     from elastocal.export.export import Wish, export, write
 
-    correction = how.pop("joint_correction", None)
-    write(export(arm, Wish(path, **how, correct_joints=correction is not None)), path, correction)
+    wish = Wish(path, **how, correct_joints=joint_correction is not None)
+    write(export(arm, wish), path, joint_correction)
 
 
 def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:

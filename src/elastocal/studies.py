@@ -45,7 +45,7 @@ from pydantic import Field
 from elastocal import __version__, messages
 from elastocal.above import checked_arguments, whole
 from elastocal.config import Table, checked, read_toml
-from elastocal.files import atomic_write, read_bytes, read_json, read_text
+from elastocal.files import atomic_write, read_bytes, read_record, read_text
 from elastocal.messages import ElastocalError, InputError, listed, option, quoted, require
 from elastocal.screen import StudyStop, shown
 
@@ -197,9 +197,9 @@ def _task_hash(digest: str, seed: int, index: int, values: Row) -> str:
     return _hash(digest, seed, index, json.dumps(values, sort_keys=True))
 
 
-def _json(where: str, value: Any) -> str:
+def _json(where: str, value: Any) -> bytes:
     try:
-        return json.dumps(value, allow_nan=False)
+        return json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
     except (TypeError, ValueError) as error:
         told = "finite numbers, text, true/false, lists and tables of them"
         raise InputError(f"{where}: {error}; use plain JSON values: {told}") from None
@@ -272,8 +272,10 @@ def execute(sources: Sources, task: Row) -> Row:
             raise RuntimeError(f"{told} {sources.version}; install the same there")
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
         line = line_of(task, rows=_checked_rows(found, sources.stated.columns, task["values"]))
-    except (Exception, SystemExit) as error:
-        told = " ".join([f"{type(error).__name__}:", *str(error).split()])
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        told = messages.printable(" ".join([f"{type(error).__name__}:", *str(error).split()]))
         line = line_of(task, told, trace=traceback.format_exc())
     return line | {"task_seconds": time.perf_counter() - begun}
 
@@ -302,6 +304,8 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     kind, takes = KINDS.get(unit, (float, "a number"))
     if type(value) is int and kind is float:
         value = float(value)
+    if kind is str:
+        _json(f"column {name!r}", value)  # no half of a letter, as in a file's name
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
     if isinstance(value, float) and not math.isfinite(value):
@@ -309,7 +313,6 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     return value
 
 
-MAX_BYTES = 100_000_000  # of the record
 MOST_RESULTS = 10_000_000_000  # bytes
 SCHEMA = "elastocal/study/1"
 RESULTS, STATEMENT, FAILURES, LOCK = "results.jsonl", "_study.json", "_failures.log", ".lock"
@@ -325,7 +328,7 @@ def opened(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); name another") from None
-    ours = OURS if statement_of(folder).get("schema") == SCHEMA else set()
+    ours = OURS if read_record(folder / STATEMENT).get("schema") == SCHEMA else set()
     visible = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
     foreign = ", ".join(sorted(visible - ours)[:3])
     told = f"{folder}: holds {foreign}, which no study wrote; name a folder of its own"
@@ -372,14 +375,6 @@ def result_lines(folder: Path) -> list[Row]:
     return [found[index] for index in sorted(found)]
 
 
-def statement_of(folder: Path) -> dict[str, Any]:
-    try:
-        found = read_json(folder / STATEMENT, "record", MAX_BYTES, "remove it")
-    except InputError:
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
 @checked_arguments
 def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     """The rows of a study, sorted by task and row; failed tasks only where `failed`.  Columns:
@@ -387,7 +382,8 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     task_error.  Raises InputError where there are none, or a result is there twice."""
     import pandas as pd
 
-    found, columns = result_lines(Path(folder)), statement_of(Path(folder)).get("columns", {})
+    found, stated = result_lines(Path(folder)), read_record(Path(folder) / STATEMENT)
+    columns = stated.get("columns", {})
     require(found, f"{folder}: holds no results; run elastocal study first")
     values = list(dict.fromkeys(name for line in found for name in line["values"]))
     names = ["task", "task_hash", *values, "task_row", *columns, "task_seconds", "elastocal"]
@@ -619,7 +615,7 @@ def run_study(
 def _known(study: Study, folder: Path, retry_failed: bool) -> tuple[list[Row], list[str]]:
     """The lines of results there are, and the digests of earlier sources that made some of them."""
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
-    before, columns = statement_of(folder), study.sources.stated.columns
+    before, columns = read_record(folder / STATEMENT), study.sources.stated.columns
     told = f"{folder}: has other columns, types or units than the study now. {here}"
     require(before.get("columns", columns) == columns, told)
     lines, seed = result_lines(folder), study.sources.stated.seed

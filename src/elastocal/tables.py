@@ -505,8 +505,7 @@ def _parquet(source: str, what: str) -> str:
             ) from None
         except Exception as error:  # it has exceptions of its own
             raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
-    frame = frame.reset_index() if any(frame.index.names) else frame
-    return str(frame.to_csv(index=False, lineterminator="\n"))
+    return str(frame.to_csv(index=any(frame.index.names), lineterminator="\n"))
 
 
 def write_csv(

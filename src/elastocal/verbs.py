@@ -357,7 +357,7 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats)
-    if isinstance(plan, str | Path) or hasattr(plan, "to_csv"):
+    if isinstance(plan, str | Path) or hasattr(plan, "iterrows"):
         poses = made.read_plan(plan)
     elif type(plan).__name__ == "Plan":
         poses = plan.table()
@@ -607,6 +607,7 @@ def compensate(
     """
     import numpy as np
 
+    from elastocal.compensation import check_frame
     from elastocal.compensation import compensate as run
     from elastocal.model.calibrated import CalibratedArm, tool_point
     from elastocal.model.effects.base import given_force
@@ -629,13 +630,6 @@ def compensate(
     return run(arm, wanted, where, start, cast(int, seed), progress or _silent)
 
 
-def check_frame(frame: str) -> None:
-    from elastocal.compensation import FRAMES
-
-    told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
-    require(frame in FRAMES, told)
-
-
 def _targets(
     targets: Any, kinds: tuple[str, ...], frame: Literal["base", "tracker"], force: Array | None
 ) -> Targets:
@@ -645,14 +639,13 @@ def _targets(
 
     if isinstance(targets, Targets):
         return targets
-    if isinstance(targets, str | Path) or hasattr(targets, "to_csv"):
+    if isinstance(targets, str | Path) or hasattr(targets, "iterrows"):
         return read_targets(targets, kinds, frame, force)
     found = np.asarray(targets, dtype=float)
     if found.shape in ((3,), (4, 4)):
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
-    placed = oriented or (found.ndim == 2 and found.shape[1] == 3)
-    right = placed and len(found) > 0
+    right = (oriented or (found.ndim == 2 and found.shape[1] == 3)) and len(found) > 0
     told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found"
     require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
     if oriented:

@@ -184,7 +184,7 @@ def test_a_bad_plug_in_is_one_sentence_with_file_and_line(code: str, tmp_path: P
         ("0.0, 5e-5", "0.0, -5e-5", "typical size above 0 or None; found 0.0, -5e-05"),
         ('p["lobes_sin"] * ca', 'p["lobes_sin"] ** 2 * ca', r"shape \(1, 1\), linear in the param"),
         ('return p["lobes_sin"]', 'return 1 + p["lobes_sin"]', "p and zero where they are"),
-        ("3 * arm", "np.nan * arm", "or three_lobes of a plug-in gives no|no number there"),
+        ("3 * arm", "np.nan * arm", ": what three_lobes.* moves is no number there;"),
         ("3 * arm", 'arm.input("tyme", 1) * arm', "arm.input takes approach, .*found 'tyme'"),
         ('"turning joints"', '"joint"', "ThreeLobes.at takes joints, .*found 'joint'"),
     ],
@@ -270,7 +270,7 @@ def test_who_allows_it(module: str, strange: Path, monkeypatch: pytest.MonkeyPat
     for trusted in ("", "0", "no", str(strange / "within"), "."):
         monkeypatch.setenv(files.TRUSTED, trusted)
         for asked in (cell, read_cell(cell)):
-            with pytest.raises(InputError, match=rf"{module.removesuffix('.py')}.*plugins=True"):
+            with pytest.raises(InputError, match=rf"{module[:6]}.*l\(.*, plugins=True\)"):
                 Model(asked)
     assert not ran.exists()
     for trusted in ("1", str(strange), f"/nowhere:{strange.parent}", ""):

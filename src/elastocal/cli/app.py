@@ -42,7 +42,7 @@ from typer.core import TyperGroup
 
 from elastocal import __version__
 from elastocal.above import LARGEST_SEED, kinds_of
-from elastocal.files import TRACEBACK, check_output, explained, is_plugin_file, together
+from elastocal.files import TRACEBACK, apart, check_output, explained, together
 from elastocal.messages import ElastocalError, InputError, flag_of, json_text, require, saying
 from elastocal.screen import complain, interrupts, progress_line, safe_console, say
 
@@ -175,16 +175,6 @@ def repeated() -> str:
     return shlex.join(["elastocal", *sys.argv[1:]])
 
 
-def files_of(cell: Cell) -> list[Path]:
-    robot, targets = cell.robot, cell.design.test_path
-    solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
-    path = None if targets is None else targets.file
-    named = [robot.urdf, robot.mjcf, robot.dh, robot.masses, cell.design.taught, path]
-    named += [solid.mesh for solid in solids]
-    named += [Path(name) for name in cell.plugins if is_plugin_file(name)]
-    return [path for path in named if path is not None]
-
-
 Asked: TypeAlias = dict[str, Any]
 # Metavar and meaning of an option that is another thing as a text than in Python.
 Texts: TypeAlias = Mapping[str, tuple[str, Callable[[Any], Any]]]
@@ -247,15 +237,9 @@ class Run:
         """Refused is to write over an input or a file that the `cell` names, or two outputs into
         one."""
         given = [path for path in paths if path is not None]
-        # Not Path.resolve, which raises RuntimeError where links go round in a circle.
-        inputs = {*map(os.path.realpath, [*given, *(() if cell is None else files_of(cell))])}
-        taken: set[str] = set()
-        for path in self.written:
-            real = os.path.realpath(path)
-            told = f"{path} is read and would be written over; name another output"
-            require(real not in inputs, told)
-            require(real not in taken, f"{path}: two outputs of the same name; name another one")
-            taken.add(real)
+        from elastocal.cell import files_of
+
+        apart(self.written, [*given, *(() if cell is None else files_of(cell))])
         return given
 
     def write(self, *asked: tuple[Path | None, Callable[[Path], Any]]) -> None:

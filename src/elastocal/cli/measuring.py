@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from elastocal import verbs
-from elastocal.cli.app import (
-    PAGES,
-    Asked,
-    Run,
-    command,
-    files_of,
-    named_numbers,
-    repeated,
-    whole_numbers,
-)
+from elastocal.cli.app import PAGES, Asked, Run, command, named_numbers, repeated, whole_numbers
 from elastocal.messages import InputError, counted, listed, require, said_of
 from elastocal.screen import interrupts, say
 
@@ -169,6 +160,7 @@ def design(
         picture: Picture of the poses to write (PNG, SVG).
         cell_out: Cell file to write, with what [design.choose] has chosen.
     """
+    from elastocal.cell import files_of
     from elastocal.files import atomic_write
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.poses import plan_and_names

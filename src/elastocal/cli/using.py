@@ -254,7 +254,7 @@ def compensate(
     from elastocal.report.smaller_views import compensation_blocks
 
     # What can be wrong with the options is told before any file is read.
-    verbs.check_frame(asked["frame"])
+    single.check_frame(asked["frame"])
     force = given_force(asked.get("load"))
     given = (targets is not None) + (target is not None)
     need = "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE"
@@ -367,7 +367,7 @@ def compare(
         new: Result of identify (JSON), the later one.
         cell_of_old: Cell file of both, in the old order OLD NEW.
         load: Force in N at the load point (tracker's axes); default: the measured loads.
-        level: Probability of any finding if nothing has changed.
+        level: Probability that any parameter is named if nothing has changed.
         poses: Random poses.
     """
     from elastocal.diagnosis.changes import compare as compared

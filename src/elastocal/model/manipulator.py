@@ -490,6 +490,8 @@ def check_equilibrium(
     added = {p.effect for p in model.parameters}.intersection(CATALOGUE) - BUILT_IN
     remedy += f"; or {listed(sorted(added))} of a plug-in gives no number there" * bool(added)
     for i in bad[:1]:
+        if added and not model.symbolic.arm.springs:
+            no_number(table, i, listed(sorted(added)))
         raise InputError(
             f"{table.source}, line {table.row[i]}: no static equilibrium under this load "
             f"({len(bad)} rows); the compliances are too large for the force: {remedy}"

@@ -31,7 +31,7 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal import __version__
-from elastocal.above import checked_arguments
+from elastocal.above import checked_arguments, sources
 from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import cell_meaning, check_known, listed, option, printable, quoted, require
@@ -102,7 +102,7 @@ def print_blocks(console: Console, blocks: Iterable[say.Block], details: bool = 
             if heading and _needs(heading, block):
                 console.print(Text(heading, style="bold underline"))
             for each in shown:
-                console.print(each)
+                console.print(each, crop=False)  # wider than the screen, rather than cut
             heading, before = "", kind
 
 
@@ -148,12 +148,12 @@ def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
                       box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)  # fmt: skip
     for k, head in enumerate(shown.heads):
         words, cells = k in shown.words, [row[k] for row in shown.rows]
-        longest = max((len(w) for text in (head, *cells) for w in text.split()), default=0)
-        longest = longest if words else max([longest, *map(len, cells)])
-        whole = words and longest <= LONGEST_WHOLE and (not k or head in ("unit", ""))
+        word = max((len(w) for text in (head, *cells) for w in text.split()), default=0)
+        longest = word if words else max([word, *map(len, cells)])
+        held = words and longest <= LONGEST_WHOLE and (not k or "±" in head or head in ("unit", ""))
         gives_way = words and any(" " in cell for cell in cells)
         table.add_column(head, justify="left" if words else "right", overflow="fold",
-                         min_width=longest if whole else None,
+                         min_width=word if held or not words else None,
                          width=longest if tight and not gives_way else None)  # fmt: skip
     for row in shown.rows:
         table.add_row(*(Text(printable(cell), STYLES.get(cell, "")) for cell in row))
@@ -364,23 +364,11 @@ def plotly() -> tuple[str, str]:
     return source, base64.b64encode(gzip.compress(source.encode(), 9, mtime=0)).decode()
 
 
-def sources(result: Any) -> list[Path]:
-    of_kind: dict[str, Callable[[Any], list[Any]]] = {
-        "Comparison": lambda c: [c.old.model.cell.path, c.old.source, c.new.source],
-        "Compensation": lambda c: [c.targets.table.source],
-        "Calibration": lambda c: [c.model.cell.path, c.observations.table.source],
-        "Diagnosis": lambda d: [d.model.cell.path, d.data],
-        "Plan": lambda p: [p.model.cell.path],
-        "Measurements": lambda table: [table.source],
-    }
-    named = of_kind.get(type(result).__name__, lambda r: [])(result)
-    return [Path(path) for path in named if path is not None and Path(path).is_file()]
-
-
 def digests_of(inputs: Inputs) -> dict[str, str]:
     if inputs is None or isinstance(inputs, Mapping):
         return dict(inputs or {})
     found = {}
+    require(isinstance(inputs, Iterable), f"{option('inputs')} takes paths; found {inputs}")
     for path in [inputs] if isinstance(inputs, str | Path) else inputs:
         with open_input(path, "input file") as handle:
             found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
