@@ -294,23 +294,28 @@ DEPENDENT = 1e-8  # of the largest; what is less is rounding
 LEVELLED = 0.1  # share of a weight's torque that an axis feels which stands 6° off the vertical
 
 
-def levers(chain: Chain, q: ca.SX, j: int) -> ca.SX:
-    """−∂w_k/∂q_j of joint j (0-based), k ≥ j, for unit moments in turn (functions, 3); with u it is
-    the torque.  `q` (joints,) are symbols."""
-    arms, frames = [], rigid.nominal_frames(chain, q, ca.SX.eye(4))
-    for k, joint in enumerate(chain.joints[j:], start=j):
-        turns = joint.kind == "revolute"
-        own = transverse_axes(joint.axis) if turns else (joint.axis,)
-        arms += [frames[k][:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own]
-    return -ca.vertcat(*[ca.jacobian(arm, q)[:, j].T for arm in arms])
+@lru_cache
+def levers(chain: Chain) -> tuple[ca.SX, list[ca.SX]]:
+    """Symbols q (joints,), and −∂w_k/∂q_j of each joint j, k ≥ j, for unit moments in turn
+    (functions, 3); with u it is the torque."""
+    q = ca.SX.sym("q", chain.n_joints)
+    arms: list[list[ca.SX]] = []
+    for k, T in enumerate(rigid.nominal_frames(chain, q, ca.SX.eye(4))[:-1]):
+        turns, axis = chain.kinds[k] == "revolute", chain.joints[k].axis
+        own = transverse_axes(axis) if turns else (axis,)
+        arms.append([T[:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own])
+    slopes = [[ca.jacobian(arm, q) for arm in each] for each in arms]
+    return q, [
+        -ca.vertcat(*(slope[:, j].T for each in slopes[j:] for slope in each))
+        for j in range(chain.n_joints)
+    ]
 
 
 @lru_cache(maxsize=256)
 def _levers_at(chain: Chain, j: int) -> Array:
     """`levers` of joint j in random poses (POSES, functions, 3)."""
-    q = ca.SX.sym("q", chain.n_joints)
-    at = rigid.drawn_joints(chain)[2][:POSES]
-    return np.asarray(BatchFunction([q], [levers(chain, q, j)], ONCE)(at)[0])
+    (q, each), at = levers(chain), rigid.drawn_joints(chain)[2][:POSES]
+    return np.asarray(BatchFunction([q], [each[j]], ONCE)(at)[0])
 
 
 def _sizes(chain: Chain, j: int) -> dict[int, float]:
@@ -358,7 +363,8 @@ class GravitySag(DrivenEffect):
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         up, j = arm.T_tracker_base[2, :3].T, index(place)
-        torques = levers(arm.chain, arm.q_commanded, j) @ up
+        q, each = levers(arm.chain)
+        torques = ca.substitute(each[j], q, arm.q_commanded) @ up
         terms = enumerate(_sizes(arm.chain, j).items(), 1)
         return sum((p[f"sag_{n}"] * torques[k] / size for n, (k, size) in terms), ca.SX(0))
 
