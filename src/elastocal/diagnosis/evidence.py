@@ -46,7 +46,9 @@ class Spectrum:
         lam, U = np.linalg.eigh(A)
         # Rounding leaves a tiny β along directions that P removes altogether.
         seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
-        return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
+        beta = U.transpose(0, 2, 1) @ b
+        beta[~seen] = 0.0
+        return cls(lam * seen, beta)
 
     def explained(self, scale: float) -> Array:
         """What each group takes off eᵀPe, its coefficients γ charged with |γ|²/scale² (V,)."""
