@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -69,7 +69,7 @@ class Spectrum:
             each += (log_prior[some] - np.log(len(scales)))[:, None, None]
             of_all.append(log_sum(each.reshape(-1, each.shape[2]), axis=0))
             own.append(log_sum(each[..., 0]))
-        return log_sum(np.array(of_all), axis=0), np.concatenate(own)
+        return reduce(np.logaddexp, of_all), np.concatenate(own)
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
