@@ -515,15 +515,19 @@ def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
 
 
 def load_chain(cell: Cell) -> Chain:
-    from elastocal.model import dh, mjcf, urdf  # late: a model in memory needs no reader
-
-    robot = cell.robot
+    robot = cell.robot  # of one kind; a model in memory needs no reader at all
     if robot.mjcf is not None:
-        chain = mjcf.read_mjcf(robot.mjcf, robot.base, robot.flange)
+        from elastocal.model.mjcf import read_mjcf
+
+        chain = read_mjcf(robot.mjcf, robot.base, robot.flange)
     elif robot.urdf is not None:
-        chain = urdf.read_urdf(robot.urdf, robot.base, robot.flange)
+        from elastocal.model.urdf import read_urdf
+
+        chain = read_urdf(robot.urdf, robot.base, robot.flange)
     elif robot.dh is not None:
-        chain = dh.read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
+        from elastocal.model.dh import read_dh
+
+        chain = read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
     else:
         raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
     return plausible(chain, robot.masses or robot.mjcf or robot.urdf or robot.dh)
