@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import expit, log_ndtr, logsumexp, ndtr
 
-from elastocal.cell import Cell
 from elastocal.diagnosis.baseline import (
     SHARED,
     Baseline,
@@ -230,8 +229,7 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
         if item.known:
             spec = spec.with_effect(*item.what.key, settings_of(item))
     key = "extended", spec.effects, repr(spec.nominal.settings)
-    cell: Cell = replace(model.cell, model=spec)
-    return made_once(model, key, lambda: Model.assembled(model.chain, cell))
+    return made_once(model, key, lambda: model.specified(spec))
 
 
 def settings_of(item: Item) -> dict[str, float]:

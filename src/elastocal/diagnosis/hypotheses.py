@@ -252,8 +252,7 @@ def with_recorded_drivers(model: Model, table: Measurements) -> Model:
 
 
 def with_keys(model: Model, **keys: str) -> Model:
-    cell = replace(model.cell, model=replace(model.cell.model, **keys))  # type: ignore[arg-type]
-    return Model.assembled(model.chain, cell)
+    return model.specified(replace(model.cell.model, **keys))  # type: ignore[arg-type]
 
 
 def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
@@ -609,9 +608,8 @@ def compute_columns(
     observed, keys = observe(table, full.observe), {h.key for h in direct}
     asked = np.array([bool(entries) or (p.effect, p.where) in keys for p in full.parameters])
     B = np.zeros((len(table), observed.size, len(x)))
-    B[:, :, asked] = full.regressor(table, x, np.flatnonzero(asked), observed).B.reshape(
-        len(table), observed.size, -1
-    )
+    shown = full.regressor(table, x, np.flatnonzero(asked), observed).B
+    B[:, :, asked] = shown.reshape(len(table), observed.size, -1)
     spans: dict[tuple[str, str], list[int]] = {}
     for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)

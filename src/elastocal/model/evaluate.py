@@ -50,8 +50,6 @@ BINARY: dict[int, Any] = {
     # Not a product: the branch not taken may be infinite or NaN.
     ca.OP_IF_ELSE_ZERO: lambda condition, x: np.where(np.not_equal(condition, 0), x, 0.0),
 }  # fmt: skip
-# CasADi's instructions, carried out on numpy arrays.
-#
 # A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
 # array of all poses costs one numpy call per instruction and block instead of one CasADi call per
 # pose, and the same runs on complex arrays, which complex-step checks use.
@@ -179,10 +177,6 @@ class BatchFunction:
         self._most = (FEW_ONCE if backend == ONCE else FEW) * by_casadi * share  # rows of a block
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the instructions, which are made again where it goes."""
-        return {key: value for key, value in self.__dict__.items() if key != "_by_numpy"}
 
     @cached_property
     def _by_numpy(self) -> list[tuple[int, Any, int, int, int]]:

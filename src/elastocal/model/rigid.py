@@ -79,7 +79,7 @@ def joint_motion(kind: str, axis: Any, value: Any) -> ca.SX:
 
 @lru_cache
 def _turning(*axis: float) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """aaᵀ, 1 − aaᵀ and [a]× of a unit axis; an arm has few, which a diagnosis turns about 200 times."""
+    """aaᵀ, 1 − aaᵀ and [a]× of a unit axis, of which an arm has few."""
     along = np.outer(axis, axis)
     return constant(along), constant(np.eye(3) - along), constant(ca.skew(ca.DM(axis)))
 
