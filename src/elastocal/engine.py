@@ -487,17 +487,8 @@ class Products:
     rows: int
 
     def at(self, variances: Array, factor: float = 0.0) -> Standardised:
-        """The coefficients under prior variances v (k,) and noise of the deviation e^factor; the
-        last ones are kept, as what is left out is asked for where a climb has ended."""
-        asked, last = (variances.tobytes(), factor), vars(self).get("_last")
-        if last is None or last[0] != asked:
-            found = Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
-            last = vars(self)["_last"] = asked, found
-        return last[1]
-
-    def forget(self) -> None:
-        """Drop what is kept, which is as large as M."""
-        vars(self).pop("_last", None)
+        """The coefficients under prior variances v (k,) and noise of the deviation e^factor."""
+        return Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
 
     def value(self, at: Standardised) -> float:
         """−2ℓ but for n log 2π."""
