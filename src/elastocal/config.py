@@ -61,10 +61,7 @@ from elastocal.messages import (
 from elastocal.units import Array, rotation_from_rpy, to_si
 
 MAX_BYTES = 1_000_000
-STRICT = ConfigDict(
-    extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True,
-    defer_build=True,  # of two dozen tables that files may state a command meets a few
-)  # fmt: skip
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
 # A key of DEEPEST parts where a key may begin, for which tomllib takes time that grows with their
 # square.
@@ -167,8 +164,6 @@ class Record(ByValue):
                 checked_init(self, *args, **kwargs)
             except ValidationError as error:
                 raise InputError(_wrong_argument(made, error)) from None
-            finally:
-                made.__init__ = init  # at a class's first use pydantic sets its own anew
 
         made.__init__ = init
 
