@@ -248,11 +248,9 @@ def with_recorded_drivers(model: Model, table: Measurements) -> Model:
         )
         require(not by_rows, f"{told}, which this one has; take it out, or diagnose that table")
         keys["clock"] = "column"
-    return with_keys(model, **keys) if keys else model
-
-
-def with_keys(model: Model, **keys: str) -> Model:
-    return model.specified(replace(model.cell.model, **keys))  # type: ignore[arg-type]
+    if "clock" in keys:  # which effects that are active may read
+        return model.specified(replace(model.cell.model, **keys))  # type: ignore[arg-type]
+    return model.stating(**keys) if keys else model
 
 
 def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:

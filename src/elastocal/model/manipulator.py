@@ -273,6 +273,14 @@ class Model(ByValue):
         cell = replace(self.cell, model=spec)
         return Model.assembled(self.chain, cell, extra, self.symbolic.backend)
 
+    def stating(self, **keys: Any) -> Model:
+        """The same, its expressions too, where [model] states other `keys` that none of its effects
+        reads; models derived from it may."""
+        other, cell = Model.__new__(Model), self.cell
+        vars(other).update(vars(self), cell=replace(cell, model=replace(cell.model, **keys)))
+        vars(other).pop("_derived", None)
+        return other
+
     @cached_property
     def rigid(self) -> Model:
         """The nominal arm with no effect and its base at the data's origin, for registration."""
