@@ -29,9 +29,6 @@ from elastocal.units import Array
 #     log ev(s) = ½ Σ_k [s²β_k² / (1 + s²λ_k) − log(1 + s²λ_k)].
 
 
-AT_ONCE = 128  # groups whose evidence of hundreds of residuals stays in cache
-
-
 @dataclass(frozen=True)
 class Spectrum:
     """V groups of K columns: eigenvalues `lam` (V, K) of A, and `beta` (V, K, T) = Uᵀb of T
@@ -80,6 +77,7 @@ class Spectrum:
 # than n excesses tell (a tail as in Knijnenburg et al. 2009, Bioinformatics 25, of shape zero).
 
 TAIL = 0.25  # share of the flips that shows it
+AT_ONCE = 128  # groups whose evidence of as many flips stays in cache
 
 
 def exceedance(flipped: Array, observed: float) -> float:

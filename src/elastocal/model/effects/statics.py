@@ -294,7 +294,7 @@ DEPENDENT = 1e-8  # of the largest; what is less is rounding
 LEVELLED = 0.1  # share of a weight's torque that an axis feels which stands 6° off the vertical
 
 
-@lru_cache
+@lru_cache(maxsize=16)
 def levers(chain: Chain) -> tuple[ca.SX, list[ca.SX], list[Array]]:
     """Symbols q (joints,); −∂w_k/∂q_j of each joint j, k ≥ j, for unit moments in turn (functions,
     3), with u the torque; and these in random poses (POSES, functions, 3)."""
