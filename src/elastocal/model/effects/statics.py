@@ -303,11 +303,8 @@ def levers(chain: Chain) -> tuple[ca.SX, list[ca.SX], list[Array]]:
         turns, axis = chain.kinds[k] == "revolute", chain.joints[k].axis
         ways = transverse_axes(axis) if turns else (axis,)
         arms = (T[:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in ways)
-        slopes.append([ca.jacobian(arm, q) for arm in arms])
-    each = [
-        -ca.vertcat(*(slope[:, j].T for own in slopes[j:] for slope in own))
-        for j in range(chain.n_joints)
-    ]
+        slopes.append([-ca.jacobian(arm, q) for arm in arms])
+    each = [ca.vertcat(*(s[:, j].T for own in slopes[j:] for s in own)) for j in range(len(slopes))]
     return q, each, BatchFunction([q], each, ONCE)(rigid.drawn_joints(chain)[2][:POSES])
 
 
