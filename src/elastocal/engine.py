@@ -52,7 +52,7 @@ class Pack:
         return np.concatenate([part.of for part in self.parts], axis=1)
 
     @cached_property
-    def _loadings(self) -> Array:
+    def loadings(self) -> Array:
         """Those of all parts beside each other (C, m, r₁ + r₂ + …)."""
         each = (part.loading.swapaxes(1, 2).reshape(*self.e.shape, -1) for part in self.parts)
         return np.concatenate([*each], axis=2)
@@ -63,18 +63,10 @@ class Pack:
         each = [np.full(part.of.shape[1], part.loading.shape[3]) for part in self.parts]
         return np.concatenate(each)
 
-    def _by_part(self, values: Array) -> Array:
+    def by_part(self, values: Array) -> Array:
         """Sums (C, …, k) over the columns (C, …, r₁ + r₂ + …) of each part."""
         starts = np.cumsum(self._widths) - self._widths
         return np.asarray(np.add.reduceat(values, starts, axis=-1))
-
-    def times(self, u: Array) -> Array:
-        """K u (C, k, m) of each part."""
-        return self._by_part(self._loadings * (u[:, None] @ self._loadings)).swapaxes(1, 2)
-
-    def trace(self, P: Array) -> Array:
-        """tr P K (C, k) of each part."""
-        return self._by_part(np.einsum("cmk,cmk->ck", P @ self._loadings, self._loadings))
 
     @cached_property
     def _sums(self) -> sparse.csr_array:
@@ -94,7 +86,7 @@ class Pack:
 
     def V(self, theta: Array) -> Array:
         """V (C, m, m) at θ (K,), absent rows of unit variance by themselves."""
-        own = self._loadings * np.sqrt(theta[self.of]).repeat(self._widths, axis=1)[:, None]
+        own = self.loadings * np.sqrt(theta[self.of]).repeat(self._widths, axis=1)[:, None]
         V = own @ own.swapaxes(1, 2)
         if self.absent.any():
             here = ~self.absent
@@ -115,10 +107,6 @@ class Whitened:
             self.root *= ~pack.absent[:, None, :]
         self.B = self.root @ pack.B
         self.e = (self.root @ pack.e[..., None])[..., 0]
-
-    def back(self, rows: Array) -> Array:
-        """R⁻ᵀ times rows (C, m, …)."""
-        return np.asarray(self.root.transpose(0, 2, 1) @ rows)
 
 
 @dataclass(frozen=True)
@@ -220,11 +208,12 @@ class Mixed:
         slope, information = np.zeros(K), np.zeros((K, K))
         seen = np.zeros((K, len(state.x)))  # of K_l P e by x
         for w, H, z in state.each():
-            pack, u, theta = w.pack, w.back(z[..., None])[..., 0], state.theta[w.pack.of]
-            P = w.back((np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
-            Ku = pack.times(u)
-            slope += pack.added(theta * (pack.trace(P) - (Ku @ u[..., None])[..., 0]), K)
-            own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
+            pack, theta = w.pack, state.theta[w.pack.of]
+            A = w.root @ pack.loadings  # ℓᵀPe = Aᵀz, ℓᵀPℓ = Aᵀ(1 − HHᵀ)A
+            along, left = z[:, None] @ A, A - (H @ H.transpose(0, 2, 1)) @ A
+            each = theta * pack.by_part((A * left).sum(axis=1) - np.square(along[:, 0]))
+            slope += np.bincount(pack.of.ravel(), each.ravel(), K)
+            own = theta[..., None] * pack.by_part(A * along).swapaxes(1, 2)  # R⁻¹K_kPe
             information += pack.pairs(own @ own.transpose(0, 2, 1), K)
             if H.shape[2]:
                 seen += pack.added(own @ H, K)
@@ -498,17 +487,8 @@ class Products:
     rows: int
 
     def at(self, variances: Array, factor: float = 0.0) -> Standardised:
-        """The coefficients under prior variances v (k,) and noise of the deviation e^factor; the
-        last ones are kept, as what is left out is asked for where a climb has ended."""
-        asked, last = (variances.tobytes(), factor), vars(self).get("_last")
-        if last is None or last[0] != asked:
-            found = Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
-            last = vars(self)["_last"] = asked, found
-        return last[1]
-
-    def forget(self) -> None:
-        """Drop what is kept, which is as large as M."""
-        vars(self).pop("_last", None)
+        """The coefficients under prior variances v (k,) and noise of the deviation e^factor."""
+        return Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
 
     def value(self, at: Standardised) -> float:
         """−2ℓ but for n log 2π."""

@@ -147,7 +147,6 @@ def test_few_rows_are_evaluated_by_casadi_as_by_numpy() -> None:
     for n in (0, 1, 10):
         for found, expected in zip(*(f(ROWS[:n], ROWS[3]) for f in (few, plain)), strict=True):
             np.testing.assert_array_equal(found, expected)
-    few(MANY[:-1], ROWS[3])
     assert by_numpy(plain) and not by_numpy(few)
     once = BatchFunction([PAIR, p], [sparse, PAIR + p], ONCE)
     for found, expected in zip(once(MANY, ROWS[3]), plain(MANY, ROWS[3]), strict=True):

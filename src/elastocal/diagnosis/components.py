@@ -484,7 +484,6 @@ def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)
     earned, within = problem.earned(found)
     own = problem.variances(at)[len(problem.data.precision) :]
-    problem.products.forget()
     return FittedSum(at, problem.noise, earned, spread, score + float(within.sum()), problem, own)
 
 

@@ -11,7 +11,6 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import expit, log_ndtr, logsumexp, ndtr
 
-from elastocal.cell import Cell
 from elastocal.diagnosis.baseline import (
     SHARED,
     Baseline,
@@ -27,7 +26,7 @@ from elastocal.diagnosis.baseline import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns
 from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.geometry import Backlash
 from elastocal.model.evaluate import ahead
@@ -230,8 +229,7 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
         if item.known:
             spec = spec.with_effect(*item.what.key, settings_of(item))
     key = "extended", spec.effects, repr(spec.nominal.settings)
-    cell: Cell = replace(model.cell, model=spec)
-    return made_once(model, key, lambda: Model.assembled(model.chain, cell))
+    return made_once(model, key, lambda: model.specified(spec))
 
 
 def settings_of(item: Item) -> dict[str, float]:
@@ -274,7 +272,7 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
     # From both to the load alone.
-    other = replace(dataset.base, model=with_keys(model, play_side=BY_LOAD))
+    other = replace(dataset.base, model=model.stating(play_side=BY_LOAD))
     columns = replace(dataset.columns, base=other, rows=dataset.columns.rows.copy())
     by_load = compute_columns(other, play, entries=())
     for h in play:

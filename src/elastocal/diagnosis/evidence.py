@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.hypotheses import ANY_SCALES, NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.model.evaluate import ahead
+from elastocal.model.evaluate import ahead, row_blocks
 from elastocal.units import Array
 
 # With columns C scaled to their typical sizes, γ ~ N(0, s² I) and everything else integrated out,
@@ -43,7 +43,9 @@ class Spectrum:
         lam, U = np.linalg.eigh(A)
         # Rounding leaves a tiny β along directions that P removes altogether.
         seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
-        return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
+        beta = U.transpose(0, 2, 1) @ b
+        beta[~seen] = 0.0
+        return cls(lam * seen, beta)
 
     def explained(self, scale: float) -> Array:
         """What each group takes off eᵀPe, its coefficients γ charged with |γ|²/scale² (V,)."""
@@ -55,6 +57,17 @@ class Spectrum:
         each = at_scales(self.lam, self.beta[..., :1], scales)[..., 0]
         return log_sum(each, axis=1) - np.log(len(scales))
 
+    def mixed(self, scales: Array, log_prior: Array) -> tuple[Array, Array]:
+        """Log evidence of each residual (T,) by all groups, of prior probabilities (V,), and of the
+        readings' by each group with its prior (V,)."""
+        of_all, own = list[Array](), list[Array]()
+        for some in row_blocks(len(self.lam), AT_ONCE):
+            each = at_scales(self.lam[some], self.beta[some], scales)
+            each += (log_prior[some] - np.log(len(scales)))[:, None, None]
+            of_all.append(log_sum(each.reshape(-1, each.shape[2]), axis=0))
+            own.append(log_sum(each[..., 0]))
+        return reduce(np.logaddexp, of_all), np.concatenate(own)
+
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
 # since the evidence's ratio has the mean 1 under the noise (Markov's inequality); where the flips
@@ -64,6 +77,7 @@ class Spectrum:
 # than n excesses tell (a tail as in Knijnenburg et al. 2009, Bioinformatics 25, of shape zero).
 
 TAIL = 0.25  # share of the flips that shows it
+AT_ONCE = 128  # groups whose evidence of as many flips stays in cache
 
 
 def exceedance(flipped: Array, observed: float) -> float:
@@ -300,7 +314,7 @@ def direct(C: Array, at: Projection, residuals: Sequence[SignedResiduals] = ()) 
 
 # Numbers of regressor directions that are held at a time: with more of them the sums over thousands
 # of visits wait for memory.
-HELD = 300_000
+HELD = 100_000
 
 
 @dataclass
@@ -384,9 +398,7 @@ class Scan:
         whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
         for what, w in zip(whats, prior.tolist(), strict=True):
             grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
-            each = at_scales(spectra.lam, spectra.beta, what.scales)
-            each += (grid.log_prior - np.log(len(what.scales)))[:, None, None]
-            evidence, own = log_sum(each.reshape(-1, each.shape[2]), axis=0), log_sum(each[..., 0])
+            evidence, own = spectra.mixed(what.scales, grid.log_prior)
             k = int(np.argmax(own))
             rows.append(evidence)
             # What the search over settings costs stays with the item.

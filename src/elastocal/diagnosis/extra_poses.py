@@ -13,7 +13,7 @@ import numpy as np
 from elastocal.diagnosis.baseline import SHARED, SMALLEST_NOISE, Baseline, NoiseValues, fit_baseline
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
-from elastocal.diagnosis.hypotheses import possible, with_keys
+from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.rivals import (
     APART_AT_LAST,
     Discrimination,
@@ -242,7 +242,8 @@ def plan_extra(
     base, advice, none = diagnosis.calibrated, list[str](), ""
     assert base is not None
     if base.model.cell.model.torque == "measured":
-        base = fit_baseline(with_keys(base.model, torque="computed"), base.observed.table, seed)
+        computed = base.model.specified(replace(base.model.cell.model, torque="computed"))
+        base = fit_baseline(computed, base.observed.table, seed)
         advice.append("torques of poses not measured yet are computed from load and weights")
     progress("extra poses: drawing candidates")
     try:

@@ -248,12 +248,9 @@ def with_recorded_drivers(model: Model, table: Measurements) -> Model:
         )
         require(not by_rows, f"{told}, which this one has; take it out, or diagnose that table")
         keys["clock"] = "column"
-    return with_keys(model, **keys) if keys else model
-
-
-def with_keys(model: Model, **keys: str) -> Model:
-    cell = replace(model.cell, model=replace(model.cell.model, **keys))  # type: ignore[arg-type]
-    return Model.assembled(model.chain, cell)
+    if "clock" in keys:  # which effects that are active may read
+        return model.specified(replace(model.cell.model, **keys))  # type: ignore[arg-type]
+    return model.stating(**keys) if keys else model
 
 
 def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
@@ -585,7 +582,8 @@ def compute_columns(
     base: Baseline, hypotheses: list[Hypothesis], found: dict[str, float] | None = None,
     entries: Sequence[Entry] = ENTRIES,
 ) -> Columns:  # fmt: skip
-    """One evaluation of B of the fitted arm with every hypothesis and entry at zero.
+    """One evaluation of B of the fitted arm with every hypothesis and entry at zero; without
+    entries the hypotheses' columns alone, others are zero.
 
     `found` are parameters of hypotheses that are not at zero, by name.
 
@@ -606,8 +604,11 @@ def compute_columns(
     full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra, ONCE))
     at = dict(zip(base.model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
-    observed = observe(table, full.observe)
-    B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
+    observed, keys = observe(table, full.observe), {h.key for h in direct}
+    asked = np.array([bool(entries) or (p.effect, p.where) in keys for p in full.parameters])
+    B = np.zeros((len(table), observed.size, len(x)))
+    shown = full.regressor(table, x, np.flatnonzero(asked), observed).B
+    B[:, :, asked] = shown.reshape(len(table), observed.size, -1)
     spans: dict[tuple[str, str], list[int]] = {}
     for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)

@@ -50,8 +50,6 @@ BINARY: dict[int, Any] = {
     # Not a product: the branch not taken may be infinite or NaN.
     ca.OP_IF_ELSE_ZERO: lambda condition, x: np.where(np.not_equal(condition, 0), x, 0.0),
 }  # fmt: skip
-# CasADi's instructions, carried out on numpy arrays.
-#
 # A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
 # array of all poses costs one numpy call per instruction and block instead of one CasADi call per
 # pose, and the same runs on complex arrays, which complex-step checks use.
@@ -136,9 +134,9 @@ def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -
 BACKENDS = ("auto", "numpy")
 ONCE = "once"  # as "auto", of a function that is asked once: the program's own, no user's
 VARIABLE = "ELASTOCAL_BACKEND"
-# A row takes CasADi 4 ns per instruction and numpy 0.15, which pays 0.3 µs per instruction and
-# block beside (one core of a 2023 server), and 6 µs per instruction before the first one.
-FEW, FEW_ONCE = 77, 1500  # rows of a block
+# A row takes CasADi 5 ns per instruction and as much as BESIDE of them; numpy pays 0.36 µs per
+# instruction and block, and 3 µs before the first one (one core of a 2023 server).
+FEW, FEW_ONCE, BESIDE = 77, 670, 80  # rows of a block, of many instructions
 
 
 def checked(name: str, source: str) -> str:
@@ -174,14 +172,11 @@ class BatchFunction:
         self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
     ) -> None:
         by_casadi = chosen_backend(None if backend == ONCE else backend) == "auto"
-        self._most = (FEW_ONCE if backend == ONCE else FEW) * by_casadi  # rows of a block
         self._function = f = ca.Function("rows", list(inputs), list(outputs))
+        share = f.n_instructions() / (BESIDE + f.n_instructions())
+        self._most = (FEW_ONCE if backend == ONCE else FEW) * by_casadi * share  # rows of a block
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the instructions, which are made again where it goes."""
-        return {key: value for key, value in self.__dict__.items() if key != "_by_numpy"}
 
     @cached_property
     def _by_numpy(self) -> list[tuple[int, Any, int, int, int]]:

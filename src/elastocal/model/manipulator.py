@@ -273,6 +273,14 @@ class Model(ByValue):
         cell = replace(self.cell, model=spec)
         return Model.assembled(self.chain, cell, extra, self.symbolic.backend)
 
+    def stating(self, **keys: Any) -> Model:
+        """The same, its expressions too, where [model] states other `keys` that none of its effects
+        reads; models derived from it may."""
+        other, cell = Model.__new__(Model), self.cell
+        vars(other).update(vars(self), cell=replace(cell, model=replace(cell.model, **keys)))
+        vars(other).pop("_derived", None)
+        return other
+
     @cached_property
     def rigid(self) -> Model:
         """The nominal arm with no effect and its base at the data's origin, for registration."""
@@ -517,15 +525,19 @@ def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
 
 
 def load_chain(cell: Cell) -> Chain:
-    from elastocal.model import dh, mjcf, urdf  # late: a model in memory needs no reader
-
-    robot = cell.robot
+    robot = cell.robot  # of one kind; a model in memory needs no reader at all
     if robot.mjcf is not None:
-        chain = mjcf.read_mjcf(robot.mjcf, robot.base, robot.flange)
+        from elastocal.model.mjcf import read_mjcf
+
+        chain = read_mjcf(robot.mjcf, robot.base, robot.flange)
     elif robot.urdf is not None:
-        chain = urdf.read_urdf(robot.urdf, robot.base, robot.flange)
+        from elastocal.model.urdf import read_urdf
+
+        chain = read_urdf(robot.urdf, robot.base, robot.flange)
     elif robot.dh is not None:
-        chain = dh.read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
+        from elastocal.model.dh import read_dh
+
+        chain = read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
     else:
         raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
     return plausible(chain, robot.masses or robot.mjcf or robot.urdf or robot.dh)

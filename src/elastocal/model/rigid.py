@@ -8,6 +8,7 @@ Expressions take and return CasADi `SX` (or numbers, which CasADi promotes): hom
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import casadi as ca
@@ -72,9 +73,15 @@ def joint_motion(kind: str, axis: Any, value: Any) -> ca.SX:
     a = np.asarray(axis, dtype=float)
     if kind == "prismatic":
         return transform(translation=ca.SX(ca.DM(a)) * value)
-    along, about = np.outer(a, a), constant(ca.skew(ca.DM(a)))
-    turned = constant(along) + ca.cos(value) * constant(np.eye(3) - along) + ca.sin(value) * about
-    return transform(rotation=turned)
+    along, across, about = _turning(*a.tolist())
+    return transform(rotation=along + ca.cos(value) * across + ca.sin(value) * about)
+
+
+@lru_cache
+def _turning(*axis: float) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """aaᵀ, 1 − aaᵀ and [a]× of a unit axis, of which an arm has few."""
+    along = np.outer(axis, axis)
+    return constant(along), constant(np.eye(3) - along), constant(ca.skew(ca.DM(axis)))
 
 
 def moved(kind: str, axis: Any, value: float) -> Array:

@@ -238,10 +238,10 @@ class SymbolicArm:
         theta = self.arm.theta
         law, settled = theta - self.residual, ca.SX.zeros(theta.shape[0], 1)
         if self._linear:  # h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose
-            y, deflection = ca.vec(expression), ca.substitute(law, theta, settled)
-            slope = ca.substitute(ca.jacobian(y, theta), theta, settled)
-            y = ca.substitute(y, theta, settled) + slope @ deflection
-            return ca.reshape(y, *expression.shape)
+            y = ca.vec(expression)
+            # At once: what they have in common stays one.
+            at_rest = ca.substitute([y, ca.jacobian(y, theta), law], [theta], [settled])
+            return ca.reshape(at_rest[0] + at_rest[1] @ at_rest[2], *expression.shape)
         if not self.implicit:
             return expression
         for _ in range(steps):

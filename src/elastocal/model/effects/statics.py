@@ -294,36 +294,31 @@ DEPENDENT = 1e-8  # of the largest; what is less is rounding
 LEVELLED = 0.1  # share of a weight's torque that an axis feels which stands 6° off the vertical
 
 
-def levers(chain: Chain, q: ca.SX, j: int) -> ca.SX:
-    """−∂w_k/∂q_j of joint j (0-based), k ≥ j, for unit moments in turn (functions, 3); with u it is
-    the torque.  `q` (joints,) are symbols."""
-    arms, frames = [], rigid.nominal_frames(chain, q, ca.SX.eye(4))
-    for k, joint in enumerate(chain.joints[j:], start=j):
-        turns = joint.kind == "revolute"
-        own = transverse_axes(joint.axis) if turns else (joint.axis,)
-        arms += [frames[k][:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own]
-    return -ca.vertcat(*[ca.jacobian(arm, q)[:, j].T for arm in arms])
-
-
-@lru_cache(maxsize=256)
-def _levers_at(chain: Chain, j: int) -> Array:
-    """`levers` of joint j in random poses (POSES, functions, 3)."""
-    q = ca.SX.sym("q", chain.n_joints)
-    at = rigid.drawn_joints(chain)[2][:POSES]
-    return np.asarray(BatchFunction([q], [levers(chain, q, j)], ONCE)(at)[0])
+@lru_cache(maxsize=16)
+def levers(chain: Chain) -> tuple[ca.SX, list[ca.SX], list[Array]]:
+    """Symbols q (joints,); −∂w_k/∂q_j of each joint j, k ≥ j, for unit moments in turn (functions,
+    3), with u the torque; and these in random poses (POSES, functions, 3)."""
+    q, slopes = ca.SX.sym("q", chain.n_joints), list[list[ca.SX]]()
+    for k, T in enumerate(rigid.nominal_frames(chain, q, ca.SX.eye(4))[:-1]):
+        turns, axis = chain.kinds[k] == "revolute", chain.joints[k].axis
+        ways = transverse_axes(axis) if turns else (axis,)
+        arms = (T[:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in ways)
+        slopes.append([-ca.jacobian(arm, q) for arm in arms])
+    each = [ca.vertcat(*(s[:, j].T for own in slopes[j:] for s in own)) for j in range(len(slopes))]
+    return q, each, BatchFunction([q], each, ONCE)(rigid.drawn_joints(chain)[2][:POSES])
 
 
 def _sizes(chain: Chain, j: int) -> dict[int, float]:
     """Number of each function that joint j moves → rms of its torque over the poses and all
     directions of the vertical.  A slide along the joint's axis is none."""
-    sizes = np.sqrt((_levers_at(chain, j) ** 2).sum(axis=2).mean(axis=0) / 3)
+    sizes = np.sqrt((levers(chain)[2][j] ** 2).sum(axis=2).mean(axis=0) / 3)
     return {k: size for k, size in enumerate(sizes.tolist()) if size > DEPENDENT * max(sizes)}
 
 
 def feels_weight(chain: Chain, j: int, up: Array) -> bool:
     """Whether weights load joint j (0-based) with the vertical `up` (3,) in the base frame: not
     where it turns about an upright axis in all poses or slides level."""
-    arms = _levers_at(chain, j)
+    arms = levers(chain)[2][j]
     return bool(((arms @ up) ** 2).sum() > LEVELLED**2 * (arms**2).sum() / 3)
 
 
@@ -358,7 +353,8 @@ class GravitySag(DrivenEffect):
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         up, j = arm.T_tracker_base[2, :3].T, index(place)
-        torques = levers(arm.chain, arm.q_commanded, j) @ up
+        q, each, _ = levers(arm.chain)
+        torques = ca.substitute(each[j], q, arm.q_commanded) @ up
         terms = enumerate(_sizes(arm.chain, j).items(), 1)
         return sum((p[f"sag_{n}"] * torques[k] / size for n, (k, size) in terms), ca.SX(0))
 
