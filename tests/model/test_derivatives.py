@@ -31,24 +31,14 @@ EPS = float(np.finfo(float).eps)
 # What changes once does so in the middle of `random_table`'s two hours; lines and smooth functions
 # have no parameters where no setting asks for any.
 SMOOTH = {"field_joint3_size": 1e-4, "field_time_size": 1e-4, "field_time_length": 2000.0}
-CHANGES = {
-    **{
-        f"joint{i}": {
-            "jump_time_s": 3000.0,
-            "order_1": 7.3,
-            "order_3": 90.5,
-            "order_sd_3": 0.1,
-            "torque_response_Nm": 1e4,
-            "approach_response_Nm": 1e4,
-        }
-        for i in range(1, 7)
-    },
-    "base": SMOOTH,
-    "link2": SMOOTH,
-    "tracker": {"jump_time_s": 4000.0},
-    **{f"marker:{name}": {"slip_time_s": 3500.0} for name in MARKERS},
-}
-CHANGES["joint2"] |= SMOOTH
+ONCE, OF_JOINTS = {"jump_time_s": 4000.0}, {
+    "jump_time_s": 3000.0, "order_1": 7.3, "order_3": 90.5, "order_sd_3": 0.1,
+    "torque_response_Nm": 1e4, "approach_response_Nm": 1e4,
+}  # fmt: skip
+CHANGES = {f"joint{i}": OF_JOINTS for i in range(1, 7)} | {f"link{i}": ONCE for i in range(1, 6)}
+CHANGES |= {f"marker:{name}": {"slip_time_s": 3500.0} for name in MARKERS}
+CHANGES |= {"base": SMOOTH, "link2": ONCE | SMOOTH, "tracker": ONCE, "tool": ONCE}
+CHANGES["joint2"] = OF_JOINTS | SMOOTH
 for place in CATALOGUE["residual_step"].places(kr270_chain(), kr270_cell()):
     CHANGES[place] = CHANGES.get(place, {}) | {"step_time_s": 3200.0}
 SPRING = Nominal(COMPLIANCE, gravity_compensator=COMPENSATOR, settings=CHANGES)

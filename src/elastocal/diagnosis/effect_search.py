@@ -484,6 +484,7 @@ class ForwardSelection:
             current = best
             slots.append(slot)
             if (anew := relinearised(self.dataset, current)) is not self.dataset:
+                anew.grids.update(self.dataset.grids)
                 self.dataset = anew
                 self._fitted.clear()  # what was fitted about another fit is void
                 current = ModelSet(anew, current.items, current.noise)
@@ -537,6 +538,7 @@ class ForwardSelection:
         offset = sum(item.log_prior for item in current.items) - base
         offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
         slot, best = Slot(scanned.items, scanned.scores + offset), None
+        items = list(slot.items)
         close, there = self._close(slot, behind), {id(item.what) for item in current.items}
         scores = slot.scores.copy()
         added = [k for k in close if id(slot.items[k].what) not in there]
@@ -544,11 +546,12 @@ class ForwardSelection:
         fits = self._with_each(current, [slot.items[k] for k in added])
         for k, fitted in zip(added, fits, strict=True):
             scores[k] = -np.inf if fitted.excessive else fitted.score - base
+            items[k] = fitted.items[-1]
             if not fitted.excessive and (best is None or fitted.score > best.score):
                 best = fitted
         if best is not None and current.items and best.score <= base:
             best = None
-        return best, Slot(slot.items, scores)
+        return best, Slot(tuple(items), scores)
 
     def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
         """The set with each of the items more, its noise and settings fitted; kept, since they are
@@ -563,7 +566,9 @@ class ForwardSelection:
 
         columns = ((s, with_items(dataset, s, (1.0,) * len(s))) for s in new.values())
         for key, found in zip(new, ahead(fitted, columns, dataset.data.threads), strict=True):
-            self._fitted[key] = refine(dataset, found, len(found.items) - 1)
+            self._fitted[key] = refined = refine(dataset, found, len(found.items) - 1)
+            if (of := refined.items[-1]).settings is not found.items[-1].settings:
+                dataset.grids[of.what.key] = dataset.grids[of.what.key].through(of.settings)
         return [self._fitted[key] for key in keys]
 
     def _close(self, slot: Slot, behind: float) -> IntArray:
