@@ -200,14 +200,15 @@ def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[st
     """d of item k from each other hypothesis that the data could mean instead.  d² = min over β, γ
     of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's columns C at its best
     settings and s = PLAUSIBLE times the widest of the size prior: in standard deviations.  A rival
-    larger than usual is less probable, but it is no less alike."""
+    larger than usual is less probable, but it is no less alike; not of what the item is a special
+    case of, which could look otherwise and does not."""
     v, data = chosen.signal(k), chosen.beside(k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
     signal = float((v * at.u).sum())
-    out: dict[tuple[str, str], float] = {}
+    out, what = dict[tuple[str, str], float](), chosen.items[k].what
     for h in dataset.hypotheses:
-        if h is not chosen.items[k].what:
+        if h is not what and what.key[0] not in h.effect.special_cases:
             found = grams.of(h, settings_to_try(dataset, h, chosen.items[k]))
             explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
             out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))
@@ -567,8 +568,10 @@ class ForwardSelection:
         columns = ((s, with_items(dataset, s, (1.0,) * len(s))) for s in new.values())
         for key, found in zip(new, ahead(fitted, columns, dataset.data.threads), strict=True):
             self._fitted[key] = refined = refine(dataset, found, len(found.items) - 1)
+            # Under less noise an effect is worth nothing a visit beside its moment.
             if (of := refined.items[-1]).settings is not found.items[-1].settings:
-                dataset.grids[of.what.key] = dataset.grids[of.what.key].through(of.settings)
+                grid = dataset.grids[of.what.key]
+                grid.values[grid.nearest(of.settings)] = of.settings
         return [self._fitted[key] for key in keys]
 
     def _close(self, slot: Slot, behind: float) -> IntArray:

@@ -289,13 +289,6 @@ class SettingsGrid:
         """The point that stands for `settings` (settings,), which were refined from it."""
         return int(np.abs(self.values - settings).sum(axis=1).argmin())
 
-    def through(self, settings: Array) -> SettingsGrid:
-        """With `settings` in place of the point that stands for them: under less noise than it was
-        found in, an effect is worth nothing a visit beside its moment."""
-        values = self.values.copy()
-        values[self.nearest(settings)] = settings
-        return replace(self, values=values)
-
 
 NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
 

@@ -316,8 +316,7 @@ class FrameJump(Jump):
 class LinkJump(Jump):
     """The next joint's frame moves by (jump_x … jump_rz) for t ≥ T = `jump_time_s`, along its axes.
 
-    In m and rad.  A collision bends the link, or a part of it is mounted anew.  What turns about a
-    joint's axis alone is an `encoder_jump`.
+    In m and rad.  A collision bends the link; what turns a joint alone is an `encoder_jump`.
     """
 
     name, stage, at = "link_jump", "geometry", "links"
