@@ -95,14 +95,12 @@ def at_postures(load=DOWN, n=4):
 )
 def test_every_effect_is_undone(effects):
     names = {e.partition(":")[0] for e in effects}
-    asked = {
-        "joint_curve": ("joint2", {"curve_low_rad": -2.4, "curve_high_rad": 0.0}),
-        "encoder_jump": ("joint3", {"jump_time_s": 3000.0}),
-        "frame_jump": ("tracker", {"jump_time_s": 4000.0}),
-        "link_jump": ("link2", {"jump_time_s": 4000.0}),
-        "tool_jump": ("tool", {"jump_time_s": 4000.0}),
-        "marker_slip": ("marker:M1", {"slip_time_s": 2000.0}),
-    }
+    asked = {"joint_curve": ("joint2", {"curve_low_rad": -2.4, "curve_high_rad": 0.0}),
+             "encoder_jump": ("joint3", {"jump_time_s": 3000.0}),
+             "frame_jump": ("tracker", {"jump_time_s": 4000.0}),
+             "link_jump": ("link2", {"jump_time_s": 4000.0}),
+             "tool_jump": ("tool", {"jump_time_s": 4000.0}),
+             "marker_slip": ("marker:M1", {"slip_time_s": 2000.0})}  # fmt: skip
     nominal = Nominal(
         joint_compliance=COMPLIANCE,
         gravity_compensator=COMPENSATOR if "gravity_compensator" in names else None,

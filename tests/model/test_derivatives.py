@@ -217,12 +217,9 @@ def test_with_measured_torques(observed: str) -> None:
 def test_with_a_compliance_per_level(observed: str, deflection_model: str) -> None:
     """k2 split as in Table 2: each level's column is that of k2 in its own rows, else zero."""
     levels = tuple(np.radians([-0.01, -25.24, -56.9]))
-    cell = full_cell(
-        ("joint_compliance", "joint_offset", "gravity_compensator"),
-        observed,
-        deflection_model=deflection_model,
-        compliance_levels={"joint2": levels},
-    )
+    cell = full_cell(("joint_compliance", "joint_offset", "gravity_compensator"), observed,
+                     deflection_model=deflection_model,
+                     compliance_levels={"joint2": levels})  # fmt: skip
     table = random_table(kr270_chain(), 6, seed=8)
     level = table.configuration % 3
     q = table.q.copy()
@@ -247,10 +244,8 @@ def test_of_chains_with_sliding_joints(
     chain = read_urdf(path, base="base", flange="flange")
     assert set(chain.kinds) == {"prismatic", "revolute"}
     turning = f"joint{chain.kinds.index('revolute') + 1}"
-    nominal = Nominal(
-        joint_compliance=(1e-6,) * chain.n_joints,
-        gravity_compensator=COMPENSATOR | {"joint": turning},
-    )
+    nominal = Nominal(joint_compliance=(1e-6,) * chain.n_joints,
+                      gravity_compensator=COMPENSATOR | {"joint": turning})  # fmt: skip
     effects = ("base_frame", "joint_offset", "encoder_scale", "gear_eccentricity", "joint_drift",
                "link_geometry:link3", "thermal_expansion:all", "joint_compliance",
                f"backlash:{turning}", "gravity_compensator", "link_mass_error:link3",
