@@ -90,17 +90,17 @@ def at_postures(load=DOWN, n=4):
         ("off_axis_compliance:joint2", "link_bending:link2", "base_compliance"),
         ("gravity_compensator", "payload_error", "link_mass_error"),
         ("thermal_expansion:all", "base_drift", "joint_drift:joint2", "marker_slip:marker:M1"),
-        ("encoder_jump:joint3", "frame_jump", "marker_orientation"),
+        ("encoder_jump:joint3", "link_jump:link2", "tool_jump", "frame_jump", "marker_orientation"),
     ],
 )
 def test_every_effect_is_undone(effects):
     names = {e.partition(":")[0] for e in effects}
-    asked = {
-        "joint_curve": ("joint2", {"curve_low_rad": -2.4, "curve_high_rad": 0.0}),
-        "encoder_jump": ("joint3", {"jump_time_s": 3000.0}),
-        "frame_jump": ("tracker", {"jump_time_s": 4000.0}),
-        "marker_slip": ("marker:M1", {"slip_time_s": 2000.0}),
-    }
+    asked = {"joint_curve": ("joint2", {"curve_low_rad": -2.4, "curve_high_rad": 0.0}),
+             "encoder_jump": ("joint3", {"jump_time_s": 3000.0}),
+             "frame_jump": ("tracker", {"jump_time_s": 4000.0}),
+             "link_jump": ("link2", {"jump_time_s": 4000.0}),
+             "tool_jump": ("tool", {"jump_time_s": 4000.0}),
+             "marker_slip": ("marker:M1", {"slip_time_s": 2000.0})}  # fmt: skip
     nominal = Nominal(
         joint_compliance=COMPLIANCE,
         gravity_compensator=COMPENSATOR if "gravity_compensator" in names else None,

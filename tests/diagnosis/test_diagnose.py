@@ -30,11 +30,9 @@ from elastocal.identification.scrutiny import gap_budget
 from elastocal.model.manipulator import Model
 
 # Effects that others imitate in any poses, and those others.
-IMITATED = {
-    "gear_eccentricity:joint2": ("link_mass_error", "link2"),
-    "payload_error:load": ("link_mass_error", "link3"),
-    "off_axis_compliance:joint3": ("link_bending", "link2"),
-}
+IMITATED = {"gear_eccentricity:joint2": ("link_mass_error", "link2"),
+            "payload_error:load": ("link_mass_error", "link3"),
+            "off_axis_compliance:joint3": ("link_bending", "link2")}  # fmt: skip
 RIPPLE, DRIVEN = "gear_ripple:joint5", "thermal_expansion:link2"
 PLAIN = [k for k in FAULTS if k not in (*IMITATED, RIPPLE)]
 
@@ -136,12 +134,10 @@ def test_where_another_effect_looks_the_same_the_answer_is_both(name: str) -> No
     assert (d.effects[0].effect, d.effects[0].where) == found[0]
 
 
-WITHHELD = {
-    "gear_eccentricity:joint4": ("transmission", "joint4 angle"),
-    "marker_slip:marker:M2": ("tool", "time"),
-    "hysteresis:joint3": ("transmission", "approach of joint3"),
-    "encoder_jump:joint4": ("transmission", "time"),
-}
+WITHHELD = {"gear_eccentricity:joint4": ("transmission", "joint4 angle"),
+            "marker_slip:marker:M2": ("tool", "time"),
+            "hysteresis:joint3": ("transmission", "approach of joint3"),
+            "encoder_jump:joint4": ("transmission", "time")}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", sometimes(WITHHELD, "gear_eccentricity:joint4"))

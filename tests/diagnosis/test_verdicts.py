@@ -16,7 +16,7 @@ from elastocal.cell_tables import EffectChoice
 from elastocal.export.exportable import keep
 from elastocal.measurements import in_any_order
 from elastocal.model.calibrated import Conditions
-from elastocal.model.effects.catalogue import effect_of
+from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 
 CASES = Path(__file__).parents[1] / "cases"
 
@@ -45,7 +45,9 @@ def test_noise_of_poses_is_nothing() -> None:
 
 def test_a_gap_of_twelve_times_the_noise_is_not_nothing() -> None:
     """A joint jumped, and no effect that jumps is in the catalogue; errors add up."""
-    why = diagnosed("jump_untimed", without=("encoder_jump", "frame_jump", "marker_slip"))
+    why = diagnosed(
+        "jump_untimed", without=tuple(n for n in CATALOGUE if "jump" in n or "slip" in n)
+    )
     gap = why.gap
     assert why.verdict == "unknown_effect" and why.probability_nothing < 0.02
     left = (gap.explained**2 - gap.noise_floor**2) ** 0.5
@@ -81,6 +83,18 @@ def test_a_jump_is_found_by_the_rows_or_by_times_of_readings(night, tmp_path: Pa
         assert not keep(fit.arm, False, Conditions()).omissions
     fit = ec.identify(case / "cell.toml", case / "train.csv")
     assert "as after a jump: ask diagnose" in fit.finding("faulty_readings").remedy
+
+
+@pytest.mark.parametrize("what", ["link_jump:link2.jump_x", "tool_jump:tool.jump_y"])
+def test_what_happened_between_two_days_is_named(what: str) -> None:
+    """Among more visits than changes are searched between at first."""
+    plain, (effect, where) = ec.Model(CASES / "jump_untimed" / "cell.toml"), what.split(":")
+    place, _, _ = where.partition(".")
+    true = plain.specified(plain.cell.model.with_effect(effect, place, {"jump_time_s": 74.5}))
+    q = plain.table(np.random.default_rng(4).uniform(-1.0, 1.0, (150, 6)))
+    timed = ec.simulate(true, replace(q, time=np.arange(150.0)), values={where: 3e-3}, seed=1)
+    (jump,) = ec.diagnose(plain, replace(timed, time=None)).effects
+    assert jump.effect == effect and jump.settings["jump_time_s"] == pytest.approx(225.5, abs=1)
 
 
 def test_in_a_sorted_table_a_step_is_no_jump() -> None:

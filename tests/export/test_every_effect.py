@@ -28,7 +28,7 @@ ALWAYS = ("payload", "link_gravity")
 # Geometry, the last three of it constant once time and temperature are.
 RIGID = {
     "base_frame", "joint_offset", "link_geometry", "marker_position", "marker_orientation",
-    "thermal_expansion", "joint_drift", "encoder_jump",
+    "thermal_expansion", "joint_drift", "encoder_jump", "link_jump",
 }  # fmt: skip
 SPRINGS = {
     "joint_compliance", "off_axis_compliance", "link_bending", "base_compliance",
@@ -41,7 +41,7 @@ UNSTATED = ("torque_coupling", "torque_tilt")
 INSTRUMENT = {
     name
     for name, effect in CATALOGUE.items()
-    if (effect.stage == "tracker" and name != "base_frame") or name == "marker_slip"
+    if (effect.stage == "tracker" and name != "base_frame") or name in ("marker_slip", "tool_jump")
 }
 
 

@@ -93,7 +93,8 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
     """Of those that diagnosis adds to a model that explains everything else."""
     chain = kr270_chain()
     settings = {f"joint{i}": {"jump_time_s": 3e3, "ripple_order": 8.0} for i in range(1, 7)}
-    settings |= {"tracker": {"jump_time_s": 3e3}}
+    once = ("tracker", "tool", *(f"link{i}" for i in range(1, 6)))
+    settings |= {place: {"jump_time_s": 3e3} for place in once}
     settings |= {f"marker:{name}": {"slip_time_s": 3e3} for name in MARKERS}
     for place in CATALOGUE["residual_step"].places(chain, kr270_cell()):
         settings[place] = settings.get(place, {}) | {"step_time_s": 3e3}

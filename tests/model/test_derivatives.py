@@ -31,24 +31,14 @@ EPS = float(np.finfo(float).eps)
 # What changes once does so in the middle of `random_table`'s two hours; lines and smooth functions
 # have no parameters where no setting asks for any.
 SMOOTH = {"field_joint3_size": 1e-4, "field_time_size": 1e-4, "field_time_length": 2000.0}
-CHANGES = {
-    **{
-        f"joint{i}": {
-            "jump_time_s": 3000.0,
-            "order_1": 7.3,
-            "order_3": 90.5,
-            "order_sd_3": 0.1,
-            "torque_response_Nm": 1e4,
-            "approach_response_Nm": 1e4,
-        }
-        for i in range(1, 7)
-    },
-    "base": SMOOTH,
-    "link2": SMOOTH,
-    "tracker": {"jump_time_s": 4000.0},
-    **{f"marker:{name}": {"slip_time_s": 3500.0} for name in MARKERS},
-}
-CHANGES["joint2"] |= SMOOTH
+ONCE, OF_JOINTS = {"jump_time_s": 4000.0}, {
+    "jump_time_s": 3000.0, "order_1": 7.3, "order_3": 90.5, "order_sd_3": 0.1,
+    "torque_response_Nm": 1e4, "approach_response_Nm": 1e4,
+}  # fmt: skip
+CHANGES = {f"joint{i}": OF_JOINTS for i in range(1, 7)} | {f"link{i}": ONCE for i in range(1, 6)}
+CHANGES |= {f"marker:{name}": {"slip_time_s": 3500.0} for name in MARKERS}
+CHANGES |= {"base": SMOOTH, "link2": ONCE | SMOOTH, "tracker": ONCE, "tool": ONCE}
+CHANGES["joint2"] = OF_JOINTS | SMOOTH
 for place in CATALOGUE["residual_step"].places(kr270_chain(), kr270_cell()):
     CHANGES[place] = CHANGES.get(place, {}) | {"step_time_s": 3200.0}
 SPRING = Nominal(COMPLIANCE, gravity_compensator=COMPENSATOR, settings=CHANGES)
@@ -227,12 +217,9 @@ def test_with_measured_torques(observed: str) -> None:
 def test_with_a_compliance_per_level(observed: str, deflection_model: str) -> None:
     """k2 split as in Table 2: each level's column is that of k2 in its own rows, else zero."""
     levels = tuple(np.radians([-0.01, -25.24, -56.9]))
-    cell = full_cell(
-        ("joint_compliance", "joint_offset", "gravity_compensator"),
-        observed,
-        deflection_model=deflection_model,
-        compliance_levels={"joint2": levels},
-    )
+    cell = full_cell(("joint_compliance", "joint_offset", "gravity_compensator"), observed,
+                     deflection_model=deflection_model,
+                     compliance_levels={"joint2": levels})  # fmt: skip
     table = random_table(kr270_chain(), 6, seed=8)
     level = table.configuration % 3
     q = table.q.copy()
@@ -257,10 +244,8 @@ def test_of_chains_with_sliding_joints(
     chain = read_urdf(path, base="base", flange="flange")
     assert set(chain.kinds) == {"prismatic", "revolute"}
     turning = f"joint{chain.kinds.index('revolute') + 1}"
-    nominal = Nominal(
-        joint_compliance=(1e-6,) * chain.n_joints,
-        gravity_compensator=COMPENSATOR | {"joint": turning},
-    )
+    nominal = Nominal(joint_compliance=(1e-6,) * chain.n_joints,
+                      gravity_compensator=COMPENSATOR | {"joint": turning})  # fmt: skip
     effects = ("base_frame", "joint_offset", "encoder_scale", "gear_eccentricity", "joint_drift",
                "link_geometry:link3", "thermal_expansion:all", "joint_compliance",
                f"backlash:{turning}", "gravity_compensator", "link_mass_error:link3",

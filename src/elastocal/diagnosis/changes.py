@@ -104,8 +104,7 @@ class Comparison(Result):
         chance: (poses,) m: the standard deviation of that by the campaigns' noise alone.
         place: (poses, 3) m: where the point is, in the data's frame of the old campaign.
         forces: (L, 3) N that act at these poses, in turn.
-        loads_of: Where they come from: "the option", "the earlier campaign", "the later campaign",
-            "the cell's plan"; empty where nothing states a load.
+        loads_of: Where they come from, in words.
         first_order: Whether the campaigns determined other parameters of the arm, of which sums
             were compared, to first order.
         not_compared: What the models have and nothing was compared of, by the reason.
@@ -248,13 +247,13 @@ def _loads(old: CalibratedArm, new: CalibratedArm, force: Array | None) -> tuple
     """The forces (L, 3) to compare under and whose they are: those given, else of the earlier
     campaign, in whose frame the tool is compared, the later one, the cell's plan, where any."""
     if force is not None:
-        return force[None], "the option"
-    stated = {"the earlier campaign": old.loads, "the later campaign": new.loads,
+        return force[None], "as asked for"
+    stated = {"the earlier session": old.loads, "the later session": new.loads,
               "the cell's plan": old.model.cell.design.loads}  # fmt: skip
     for whose, loads in stated.items():
         if loads is not None and loads.any():
-            return loads[loads.any(axis=1)], whose
-    return np.zeros((1, 3)), ""
+            return loads[loads.any(axis=1)], f"those of {whose}"
+    return np.zeros((1, 3)), "as no load is stated"
 
 
 def _compared(

@@ -199,14 +199,15 @@ def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[st
     """d of item k from each other hypothesis that the data could mean instead.  d² = min over β, γ
     of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's columns C at its best
     settings and s = PLAUSIBLE times the widest of the size prior: in standard deviations.  A rival
-    larger than usual is less probable, but it is no less alike."""
+    larger than usual is less probable, but it is no less alike; not of what the item is a special
+    case of, which could look otherwise and does not."""
     v, data = chosen.signal(k), chosen.beside(k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
     signal = float((v * at.u).sum())
-    out: dict[tuple[str, str], float] = {}
+    out, what = dict[tuple[str, str], float](), chosen.items[k].what
     for h in dataset.hypotheses:
-        if h is not chosen.items[k].what:
+        if h is not what and what.key[0] not in h.effect.special_cases:
             found = grams.of(h, settings_to_try(dataset, h, chosen.items[k]))
             explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
             out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))
@@ -482,6 +483,7 @@ class ForwardSelection:
             current = best
             slots.append(slot)
             if (anew := relinearised(self.dataset, current)) is not self.dataset:
+                anew.grids.update(self.dataset.grids)
                 self.dataset = anew
                 self._fitted.clear()  # what was fitted about another fit is void
                 current = ModelSet(anew, current.items, current.noise)
@@ -535,6 +537,7 @@ class ForwardSelection:
         offset = sum(item.log_prior for item in current.items) - base
         offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
         slot, best = Slot(scanned.items, scanned.scores + offset), None
+        items = list(slot.items)
         close, there = self._close(slot, behind), {id(item.what) for item in current.items}
         scores = slot.scores.copy()
         added = [k for k in close if id(slot.items[k].what) not in there]
@@ -542,11 +545,12 @@ class ForwardSelection:
         fits = self._with_each(current, [slot.items[k] for k in added])
         for k, fitted in zip(added, fits, strict=True):
             scores[k] = -np.inf if fitted.excessive else fitted.score - base
+            items[k] = fitted.items[-1]
             if not fitted.excessive and (best is None or fitted.score > best.score):
                 best = fitted
         if best is not None and current.items and best.score <= base:
             best = None
-        return best, Slot(slot.items, scores)
+        return best, Slot(tuple(items), scores)
 
     def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
         """The set with each of the items more, its noise and settings fitted; kept, since they are
@@ -561,7 +565,11 @@ class ForwardSelection:
 
         columns = ((s, with_items(dataset, s, (1.0,) * len(s))) for s in new.values())
         for key, found in zip(new, ahead(fitted, columns, dataset.data.threads), strict=True):
-            self._fitted[key] = refine(dataset, found, len(found.items) - 1)
+            self._fitted[key] = refined = refine(dataset, found, len(found.items) - 1)
+            # Under less noise an effect is worth nothing a visit beside its moment.
+            if (of := refined.items[-1]).settings is not found.items[-1].settings:
+                grid = dataset.grids[of.what.key]
+                grid.values[grid.nearest(of.settings)] = of.settings
         return [self._fitted[key] for key in keys]
 
     def _close(self, slot: Slot, behind: float) -> IntArray:

@@ -222,10 +222,8 @@ OUT_OF_ORDER = (
 )
 
 # Key of [model], its value, the column that allows it, and the effect that it is about.
-CHOICES = (
-    ("thermal_driver", "temperature", "temperature", ThermalExpansion.name),
-    ("play_side", "load_and_approach", "approach", Backlash.name),
-)
+CHOICES = (("thermal_driver", "temperature", "temperature", ThermalExpansion.name),
+           ("play_side", "load_and_approach", "approach", Backlash.name))  # fmt: skip
 
 
 def with_recorded_drivers(model: Model, table: Measurements) -> Model:
@@ -592,12 +590,10 @@ def compute_columns(
     table = base.observed.table
     chain, cell = base.model.chain, base.model.cell
     direct = [h for h in hypotheses if not h.driven]
-    spec = replace(
-        cell.model,
-        effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
-        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
-        deflection_model="linear",
-    )
+    spec = replace(cell.model,
+                   effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
+                   observe="position" if cell.model.observe == "deflection" else cell.model.observe,
+                   deflection_model="linear")  # fmt: skip
     whole = replace(cell, model=spec)
     extra = [(e, w) for e in entries for w in e.places(chain, cell)]
     key = "columns", spec.effects, len(extra)

@@ -78,7 +78,7 @@ def rivals_of(found: ForwardSelection, k: int) -> Rivals:
     same = [
         i
         for i, other in enumerate(slot.items)
-        if other.known and id(other.what) not in taken and near[other.what.key] < TOO_NEAR
+        if id(other.what) not in taken and near.get(other.what.key, np.inf) < TOO_NEAR
     ]
     # More than so many are no answer; the others stand among the candidates.
     same = sorted(same, key=lambda i: -each[i])[: LARGEST_SET - 1]

@@ -273,7 +273,7 @@ def resource(name: str) -> str:
 
 
 # Places that are the only one their effects have: "base drift", not "base drift at base".
-SINGLE = ("base", "wrist", "load", "tracker", "arm")
+SINGLE = ("base", "wrist", "load", "tracker", "arm", "tool")
 STAGES = {
     "transmission": "transmission",
     "geometry": "links",

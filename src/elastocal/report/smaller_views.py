@@ -36,13 +36,6 @@ if TYPE_CHECKING:
 MOST_NAMED = 3  # parameters in a headline
 MOST_DRAWN = 20  # parameters
 MOST_ROWS = 40  # drawn, and shown of tables
-OF_LOADS = {
-    "": "as no load is stated",
-    "the option": "as asked for",
-    "the earlier campaign": "those of the earlier session",
-    "the later campaign": "those of the later session",
-    "the cell's plan": "those of the cell's plan",
-}
 
 
 def changes_blocks(c: Comparison) -> Iterator[say.Block]:
@@ -84,7 +77,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     loads = say.loads_text(c.forces, "{}", "{} loads in turn")
     yield say.Lines([
         ("Tool", f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} "
-         f"random poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone "
+         f"random poses within the joint limits under {loads}, {c.loads_of}; noise alone "
          f"gives {noise} rms."),
         ("Chance", f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by "
          "Holm's rule: if nothing has changed, the probability that one is named is "

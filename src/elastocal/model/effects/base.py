@@ -340,6 +340,8 @@ class Effect:
     sized_by: ClassVar[str] = ""
     # What it depends on in the first place, where its stage and needs do not say so.
     family: ClassVar[str] = ""
+    # Effects that it comes down to where few of its parameters act: those then are the cause.
+    special_cases: ClassVar[tuple[str, ...]] = ()
     # How many times its typical size it may be at most: beyond, it is something else.
     most: ClassVar[float] = 1000.0
     # Beyond what is typical it may be of any size: a ratio of the controller that is wrong, an

@@ -36,14 +36,15 @@ CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
     geometry.GearSpectrum(), smooth.JointCurve(), geometry.WristCoupling(), geometry.JointDrift(),
     geometry.EncoderJump(), geometry.MoveLag(), geometry.MoveHysteresis(), statics.GravitySag(),
     statics.TorqueCoupling(), geometry.LinkGeometry(), statics.TorqueTilt(),
-    geometry.ThermalExpansion(), statics.JointCompliance(), statics.JointHardening(),
-    geometry.Backlash(), geometry.Hysteresis(), smooth.TorqueResponse(), smooth.ApproachResponse(),
-    statics.OffAxisCompliance(), statics.LinkBending(), statics.BaseCompliance(),
-    smooth.LoadResponse(), statics.GravityCompensator(), statics.LinkGravity(),
-    statics.LinkMassError(), statics.LinkWeights(), statics.Payload(), statics.PayloadError(),
-    geometry.MarkerPosition(), geometry.MarkerSlip(), smooth.ResidualField(), smooth.ResidualStep(),
-    geometry.MarkerOrientation(), geometry.BaseDrift(), geometry.FrameJump(),
-    geometry.DistanceSensor(), geometry.TrackerDistortion(),
+    geometry.ThermalExpansion(), geometry.LinkJump(), statics.JointCompliance(),
+    statics.JointHardening(), geometry.Backlash(), geometry.Hysteresis(), smooth.TorqueResponse(),
+    smooth.ApproachResponse(), statics.OffAxisCompliance(), statics.LinkBending(),
+    statics.BaseCompliance(), smooth.LoadResponse(), statics.GravityCompensator(),
+    statics.LinkGravity(), statics.LinkMassError(), statics.LinkWeights(), statics.Payload(),
+    statics.PayloadError(), geometry.MarkerPosition(), geometry.MarkerSlip(), geometry.ToolJump(),
+    smooth.ResidualField(), smooth.ResidualStep(), geometry.MarkerOrientation(),
+    geometry.BaseDrift(), geometry.FrameJump(), geometry.DistanceSensor(),
+    geometry.TrackerDistortion(),
 )}  # fmt: skip
 BUILT_IN = frozenset(CATALOGUE)
 UNKNOWN = Effect()  # what is known of an effect that the catalogue does not have

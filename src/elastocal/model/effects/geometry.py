@@ -52,10 +52,7 @@ class BaseFrame(Effect):
     registered = True
     rank = STATION
     formats = ("rigid", "elastic")
-
-    @property
-    def of_the_measurement(self) -> bool:
-        return False  # where the base stands is the arm's
+    of_the_measurement = False  # where the base stands is the arm's
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.model.nominal
@@ -83,10 +80,8 @@ class LinkGeometry(Effect):
     name, stage, at = "link_geometry", "geometry", "links"
     rank = LINK
     formats = ("rigid", "elastic")
-    unknowns = (
-        *(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
-        *(ParameterSpec(k, "rad", 0.0, 1e-3) for k in ("rx", "ry", "rz")),
-    )
+    unknowns = (*(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
+                *(ParameterSpec(k, "rad", 0.0, 1e-3) for k in ("rx", "ry", "rz")))  # fmt: skip
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         LinkFrame().enter(arm, place, ca.vertcat(*[p[spec.key] for spec in self.unknowns]))
@@ -177,11 +172,9 @@ class TrackerDistortion(Effect):
     # Data sheets promise 12 µrad and 5 ppm; an instrument that is out by ten times the typical size
     # is one to be mended, and what is out by more is no instrument's error.
     most = 10.0
-    unknowns = (
-        ParameterSpec("scale", "1", 0.0, 2e-5),
-        ParameterSpec("refraction", "1/m", 0.0, 1e-6),
-        *(ParameterSpec(key, "rad", 0.0, 2e-5) for key in ENCODERS),
-    )
+    unknowns = (ParameterSpec("scale", "1", 0.0, 2e-5),
+                ParameterSpec("refraction", "1/m", 0.0, 1e-6),
+                *(ParameterSpec(key, "rad", 0.0, 2e-5) for key in ENCODERS))  # fmt: skip
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.observe == "distance" else ("tracker",)
@@ -219,9 +212,9 @@ MEASURE_MONUMENTS = (
 TIME_CONSTANT = Setting("time_constant_s", "time_constant", 1800.0, 60.0, 1e6)
 
 
-def pose_change(prefix: str, length: float) -> tuple[ParameterSpec, ...]:
-    """`prefix`_x … `prefix`_rz with typical sizes `length` in m and 50 µrad."""
-    sizes = {"m": length, "rad": 5e-5}
+def pose_change(prefix: str, length: float, turn: float = 5e-5) -> tuple[ParameterSpec, ...]:
+    """`prefix`_x … `prefix`_rz with typical sizes `length` in m and `turn` in rad."""
+    sizes = {"m": length, "rad": turn}
     known = zip(KEYS, MOVE, strict=True)
     return tuple(ParameterSpec(f"{prefix}_{k}", unit, 0.0, sizes[unit]) for k, unit in known)
 
@@ -244,17 +237,18 @@ class WarmUp(DrivenEffect):
         return ca.vertcat(*[p[spec.key] for spec in specs]) * self.course(arm, p)
 
 
+JUMP_TIME = Setting("jump_time_s", "change_time", None, -np.inf, np.inf)
+
+
 class Jump(WarmUp):
     """u = d for t ≥ T, d all parameters of the place and T the one setting, in s: nobody knows
     beforehand when something changed."""
 
     any_size = True
+    constants: ClassVar[tuple[Setting, ...]] = (JUMP_TIME,)
 
     def course(self, arm: Arm, p: Symbols) -> ca.SX:
         return arm.input("moment", 1) >= p[self.constants[0].key]
-
-
-JUMP_TIME = Setting("jump_time_s", "change_time", None, -np.inf, np.inf)
 
 
 class JointDrift(WarmUp):
@@ -279,7 +273,6 @@ class EncoderJump(Jump):
     """
 
     name, stage = "encoder_jump", "transmission"
-    constants = (JUMP_TIME,)
     formats = ("rigid", "elastic")
     entry = JointMotion()
     unknowns = (ParameterSpec("jump", MOTION, 0.0, 1e-4),)
@@ -308,13 +301,49 @@ class FrameJump(Jump):
     """
 
     name, stage, at = "frame_jump", "tracker", "tracker"
-    constants = (JUMP_TIME,)
     remedy = MEASURE_MONUMENTS
     entry = BaseMotion()
     unknowns = pose_change("jump", 1e-4)
 
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
         return ("base",)
+
+
+class LinkJump(Jump):
+    """The next joint's frame moves by (jump_x … jump_rz) for t ≥ T = `jump_time_s`, along its axes.
+
+    In m and rad.  A collision bends the link; what turns a joint alone is an `encoder_jump`.
+    """
+
+    name, stage, at = "link_jump", "geometry", "links"
+    formats = ("rigid", "elastic")
+    entry = LinkFrame()
+    unknowns = pose_change("jump", 1e-4)
+    special_cases = (EncoderJump.name,)
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        return links(chain)[:-1]
+
+
+class ToolJump(Jump):
+    """The flange with all markers moves by (jump_x … jump_rz) for t ≥ T = `jump_time_s`.
+
+    In m and rad, along its axes.  A tool is struck or mounted anew; another tool, with its markers
+    elsewhere, is this and slips of markers.
+    """
+
+    name, stage, at = "tool_jump", "tool", "tool"
+    entry = LinkFrame()
+    unknowns = pose_change("jump", 1e-3, 5e-4)
+    special_cases = (EncoderJump.name,)
+    of_the_measurement = True
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        # What a single marker does is a slip, but for its orientation.
+        return (self.at,) * (len(cell.tool.markers) > 1 or cell.model.observe == "pose")
+
+    def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
+        return links(chain)[-1:]
 
 
 class MarkerSlip(Jump):
@@ -327,10 +356,7 @@ class MarkerSlip(Jump):
     constants = (replace(JUMP_TIME, key="slip_time_s"),)
     entry = MarkerMotion()
     unknowns = tuple(ParameterSpec(f"slip_{k}", "m", 0.0, 1.5e-4) for k in "xyz")
-
-    @property
-    def of_the_measurement(self) -> bool:
-        return True  # the marker slipped during one campaign
+    of_the_measurement = True  # the marker slipped during one campaign
 
 
 REFERENCE_C = 20.0  # ISO 1: lengths are stated at this temperature
@@ -502,12 +528,9 @@ class GearSpectrum(DrivenEffect):
         lines = max((k for k in known if f"order_{k}" in stated), default=1)
         orders = (Setting(f"order_{k}", "order", 0.0, 0.0, 1000.0) for k in known[:lines])
         spreads = (Setting(f"order_sd_{k}", "range", 0.0, 0.0, 1000.0) for k in known[:lines])
-        return (
-            Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
-            Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0),
-            *orders,
-            *spreads,
-        )
+        return (Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
+                Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0), *orders,
+                *spreads)  # fmt: skip
 
     def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, tuple[float, float]]:
         """Numbers of the lines that there are: each one's order, and how uncertain that is."""
@@ -636,10 +659,8 @@ class Hysteresis(Effect):
         size = 5e-5
         rated = rated_torque(chain, cell, index(place))
         growth = size / rated if rated else None
-        return (
-            ParameterSpec("hysteresis", "rad", 0.0, size),
-            ParameterSpec("hysteresis_per_torque", "rad/(N*m)", 0.0, growth),
-        )
+        return (ParameterSpec("hysteresis", "rad", 0.0, size),
+                ParameterSpec("hysteresis_per_torque", "rad/(N*m)", 0.0, growth))  # fmt: skip
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
@@ -670,11 +691,9 @@ class MoveLag(DrivenEffect):
     name, stage, at = "move_lag", "transmission", "turning joints"
     family = "move"
     entry = JointMotion()
-    unknowns = (
-        ParameterSpec("move_lag", "rad", 0.0, 1e-4),
-        ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
-        ParameterSpec("move_lag_first", "rad", 0.0, 5e-5),
-    )
+    unknowns = (ParameterSpec("move_lag", "rad", 0.0, 1e-4),
+                ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
+                ParameterSpec("move_lag_first", "rad", 0.0, 5e-5))  # fmt: skip
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         i, n = index(place), arm.chain.n_joints
@@ -696,10 +715,8 @@ class MoveHysteresis(DrivenEffect):
     unless = "approach"
     family = "move"
     entry = JointMotion()
-    unknowns = (
-        ParameterSpec("move_hysteresis", "rad", 0.0, 5e-5),
-        ParameterSpec("move_hysteresis_first", "rad", 0.0, 5e-5),
-    )
+    unknowns = (ParameterSpec("move_hysteresis", "rad", 0.0, 5e-5),
+                ParameterSpec("move_hysteresis_first", "rad", 0.0, 5e-5))  # fmt: skip
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         i, n = index(place), arm.chain.n_joints
