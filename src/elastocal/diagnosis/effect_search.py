@@ -566,8 +566,9 @@ class ForwardSelection:
         columns = ((s, with_items(dataset, s, (1.0,) * len(s))) for s in new.values())
         for key, found in zip(new, ahead(fitted, columns, dataset.data.threads), strict=True):
             self._fitted[key] = refined = refine(dataset, found, len(found.items) - 1)
+            of = refined.items[-1]
             # Under less noise an effect is worth nothing a visit beside its moment.
-            if (of := refined.items[-1]).settings is not found.items[-1].settings:
+            if any(setting.kind == "change_time" for setting in of.what.settings):
                 grid = dataset.grids[of.what.key]
                 grid.values[grid.nearest(of.settings)] = of.settings
         return [self._fitted[key] for key in keys]
