@@ -492,8 +492,10 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """The held-out 3-D rms in m with the readings that were set apart, by their errors under
         the fit to the others; infinite where none could be held out."""
         apart = sum(o.residual**2 for o in self.excluded)
-        n, k = np.isfinite(self.held_out).sum() / self.observations.size, len(self.excluded)
-        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + k))
+        if not math.isfinite(self.heldout_rms):
+            return math.inf
+        n = np.isfinite(self.held_out).sum() / self.observations.size
+        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + len(self.excluded)))
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
