@@ -222,8 +222,10 @@ OUT_OF_ORDER = (
 )
 
 # Key of [model], its value, the column that allows it, and the effect that it is about.
-CHOICES = (("thermal_driver", "temperature", "temperature", ThermalExpansion.name),
-           ("play_side", "load_and_approach", "approach", Backlash.name))  # fmt: skip
+CHOICES = (
+    ("thermal_driver", "temperature", "temperature", ThermalExpansion.name),
+    ("play_side", "load_and_approach", "approach", Backlash.name),
+)
 
 
 def with_recorded_drivers(model: Model, table: Measurements) -> Model:
@@ -590,10 +592,12 @@ def compute_columns(
     table = base.observed.table
     chain, cell = base.model.chain, base.model.cell
     direct = [h for h in hypotheses if not h.driven]
-    spec = replace(cell.model,
-                   effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
-                   observe="position" if cell.model.observe == "deflection" else cell.model.observe,
-                   deflection_model="linear")  # fmt: skip
+    spec = replace(
+        cell.model,
+        effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
+        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
+        deflection_model="linear",
+    )
     whole = replace(cell, model=spec)
     extra = [(e, w) for e in entries for w in e.places(chain, cell)]
     key = "columns", spec.effects, len(extra)

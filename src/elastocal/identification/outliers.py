@@ -237,8 +237,8 @@ def drops(
     accidents, or but for those `explained` by one common shift each, whose cause is known, few."""
     if options.faulty != "auto" or are_accidents(observed, faulty):
         return bool(faulty.any()) and options.faulty != "keep"
-    if explained is None or follow_poses(observed, faulty):
-        return False
+    if explained is None or faulty.mean() <= FEW or follow_poses(observed, faulty):
+        return False  # few that are no accidents have been found to follow the poses
     return bool((faulty & ~explained()).mean() <= FEW)
 
 

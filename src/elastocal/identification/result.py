@@ -488,14 +488,18 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         return self.outliers + self.excluded
 
     @property
+    def held_out_counted(self) -> Array:
+        """The rows of `held_out` that `heldout_rms` is of."""
+        known = np.isfinite(self.held_out) | math.isinf(self.heldout_rms)
+        return self.held_out[known]
+
+    @property
     def heldout_all_rms(self) -> float:
         """The held-out 3-D rms in m with the readings that were set apart, by their errors under
         the fit to the others; infinite where none could be held out."""
         apart = sum(o.residual**2 for o in self.excluded)
-        if not math.isfinite(self.heldout_rms):
-            return math.inf
-        n = np.isfinite(self.held_out).sum() / self.observations.size
-        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + len(self.excluded)))
+        n, k = len(self.held_out_counted) / self.observations.size, len(self.excluded)
+        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + k))
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""

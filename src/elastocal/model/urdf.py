@@ -623,11 +623,16 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
         limit = None if kind == "continuous" else (lower, upper)
     mimic, rpy = tag.first("mimic"), _vector(where, tag, "origin", "rpy")
     chain.check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
-    parent, child = (_end(where, tag, side, links) for side in ("parent", "child"))
-    origin = pose_at(_vector(where, tag, "origin", "xyz"), rotation_from_rpy(rpy))
-    follows = None if mimic is None else mimic.get("joint").strip()
-    axis = axis / length if length else axis
-    return FileJoint(name, kind, parent, child, origin, axis, limit, follows)
+    return FileJoint(
+        name,
+        kind,
+        parent=_end(where, tag, "parent", links),
+        child=_end(where, tag, "child", links),
+        origin=pose_at(_vector(where, tag, "origin", "xyz"), rotation_from_rpy(rpy)),
+        axis=axis / length if length else axis,
+        limit=limit,
+        follows=None if mimic is None else mimic.get("joint").strip(),
+    )
 
 
 def _end(where: str, joint: Tag, side: str, links: Collection[str]) -> str:

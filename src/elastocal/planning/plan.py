@@ -153,7 +153,8 @@ class Certificate:
 
     `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a Φ
     below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched` poses
-    and `ascents` local searches.  `starts`: where each start of it ended, in the plan's unit."""
+    and `ascents` local searches.  `starts`: where each start of it ended, in the plan's unit.
+    """
 
     pool: int
     bound_pool: float | None = None
@@ -327,7 +328,8 @@ class LoadStates:
     """In which load states poses are read: each in `"all"`, or each in those `"chosen"` for it.
 
     `crossed` and `chosen`: the relaxed optimum of both in the plan's unit, in as much time; None
-    where there is nothing to choose, and `why`."""
+    where there is nothing to choose, and `why`.
+    """
 
     used: Literal["all", "chosen"]
     why: str
@@ -455,7 +457,8 @@ class Plan(Result):
         of its stops, note_order_2 the second, …; note_load, note_load_2, … what of the load states
         hangs there.  A pose that is approached from both sides is two configurations, 7+ (joints
         moving up to it) and 7-.  Where only some markers are seen there is a row for each, where
-        poses are not read alike note_readings says how often each is."""
+        poses are not read alike note_readings says how often each is.
+        """
         forces, kinds = self.stated_forces, self.model.chain.kinds
         timed = self.execution.stops[0].time is not None
         # Of deflections each loaded reading has one partner, the mean of those without load.
@@ -537,7 +540,8 @@ class Plan(Result):
     def stated_forces(self) -> Array | None:
         """The load states (L, 3) in N where the plan's rows state them; else None.
 
-        They do where there are several loads, poses are revisited, or a load hides a marker."""
+        They do where there are several loads, poses are revisited, or a load hides a marker.
+        """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
         again = any(stop.again for stop in self.execution.stops)

@@ -7,7 +7,8 @@ first derivatives until none of them gains (column generation).  With the tangen
 
 for all weights 0 ≤ w'_i ≤ 1 with Σ_{i∈l} w'_i = n_l, exact plans among them; the maximum is
 taken greedily.  Sources: Pukelsheim, Optimal Design of Experiments (2006), ch. 5 and 7; Harman,
-Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348."""
+Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348.
+"""
 
 from __future__ import annotations
 
@@ -39,7 +40,8 @@ class DesignProblem:
 
     `blocks` (N, r, p): whitened, scaled B of each candidate; M(w) = prior + Σ_i w_i B_iᵀB_i with
     `prior` (p, p) from what is known and measured already.  `group` (N,) in 0 … L−1, `shares` (L,).
-    `source`: the cell's file, as messages begin."""
+    `source`: the cell's file, as messages begin.
+    """
 
     blocks: Array
     prior: Array

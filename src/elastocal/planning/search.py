@@ -567,7 +567,10 @@ class _Ordering:
             try:
                 return self.put(self.search.chosen)
             except Unreachable as error:
-                self._replace(error) if k else self._unwind()
+                if k == 0:
+                    self._unwind()
+                else:
+                    self._replace(error)
         return self.put(self.search.chosen)
 
     def put(self, chosen: IntArray) -> tuple[Execution, Alias | None]:

@@ -259,9 +259,7 @@ def error_line(result: Calibration) -> str:
         sizes["test data"] = result.test.rms
     text = ", ".join(f"{name} {say.length(value)}" for name, value in sizes.items())
     if result.observations.kind == "pose":
-        held = result.held_out
-        held = held[np.isfinite(held)] if math.isfinite(result.heldout_rms) else held
-        turns = (r.reshape(-1, 6)[:, 3:] for r in (result.residual, held))
+        turns = (r.reshape(-1, 6)[:, 3:] for r in (result.residual, result.held_out_counted))
         rms = (float(np.sqrt((turn**2).sum(axis=1).mean())) for turn in turns)
         told = (
             f"{say.significant(v * 1e6)} µrad" if math.isfinite(v) else "not available" for v in rms

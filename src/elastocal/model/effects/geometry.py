@@ -80,8 +80,10 @@ class LinkGeometry(Effect):
     name, stage, at = "link_geometry", "geometry", "links"
     rank = LINK
     formats = ("rigid", "elastic")
-    unknowns = (*(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
-                *(ParameterSpec(k, "rad", 0.0, 1e-3) for k in ("rx", "ry", "rz")))  # fmt: skip
+    unknowns = (
+        *(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
+        *(ParameterSpec(k, "rad", 0.0, 1e-3) for k in ("rx", "ry", "rz")),
+    )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         LinkFrame().enter(arm, place, ca.vertcat(*[p[spec.key] for spec in self.unknowns]))
@@ -172,9 +174,11 @@ class TrackerDistortion(Effect):
     # Data sheets promise 12 µrad and 5 ppm; an instrument that is out by ten times the typical size
     # is one to be mended, and what is out by more is no instrument's error.
     most = 10.0
-    unknowns = (ParameterSpec("scale", "1", 0.0, 2e-5),
-                ParameterSpec("refraction", "1/m", 0.0, 1e-6),
-                *(ParameterSpec(key, "rad", 0.0, 2e-5) for key in ENCODERS))  # fmt: skip
+    unknowns = (
+        ParameterSpec("scale", "1", 0.0, 2e-5),
+        ParameterSpec("refraction", "1/m", 0.0, 1e-6),
+        *(ParameterSpec(key, "rad", 0.0, 2e-5) for key in ENCODERS),
+    )
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.observe == "distance" else ("tracker",)
@@ -528,9 +532,12 @@ class GearSpectrum(DrivenEffect):
         lines = max((k for k in known if f"order_{k}" in stated), default=1)
         orders = (Setting(f"order_{k}", "order", 0.0, 0.0, 1000.0) for k in known[:lines])
         spreads = (Setting(f"order_sd_{k}", "range", 0.0, 0.0, 1000.0) for k in known[:lines])
-        return (Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
-                Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0), *orders,
-                *spreads)  # fmt: skip
+        return (
+            Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
+            Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0),
+            *orders,
+            *spreads,
+        )
 
     def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, tuple[float, float]]:
         """Numbers of the lines that there are: each one's order, and how uncertain that is."""
@@ -659,8 +666,10 @@ class Hysteresis(Effect):
         size = 5e-5
         rated = rated_torque(chain, cell, index(place))
         growth = size / rated if rated else None
-        return (ParameterSpec("hysteresis", "rad", 0.0, size),
-                ParameterSpec("hysteresis_per_torque", "rad/(N*m)", 0.0, growth))  # fmt: skip
+        return (
+            ParameterSpec("hysteresis", "rad", 0.0, size),
+            ParameterSpec("hysteresis_per_torque", "rad/(N*m)", 0.0, growth),
+        )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
@@ -691,9 +700,11 @@ class MoveLag(DrivenEffect):
     name, stage, at = "move_lag", "transmission", "turning joints"
     family = "move"
     entry = JointMotion()
-    unknowns = (ParameterSpec("move_lag", "rad", 0.0, 1e-4),
-                ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
-                ParameterSpec("move_lag_first", "rad", 0.0, 5e-5))  # fmt: skip
+    unknowns = (
+        ParameterSpec("move_lag", "rad", 0.0, 1e-4),
+        ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
+        ParameterSpec("move_lag_first", "rad", 0.0, 5e-5),
+    )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         i, n = index(place), arm.chain.n_joints
@@ -715,8 +726,10 @@ class MoveHysteresis(DrivenEffect):
     unless = "approach"
     family = "move"
     entry = JointMotion()
-    unknowns = (ParameterSpec("move_hysteresis", "rad", 0.0, 5e-5),
-                ParameterSpec("move_hysteresis_first", "rad", 0.0, 5e-5))  # fmt: skip
+    unknowns = (
+        ParameterSpec("move_hysteresis", "rad", 0.0, 5e-5),
+        ParameterSpec("move_hysteresis_first", "rad", 0.0, 5e-5),
+    )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         i, n = index(place), arm.chain.n_joints

@@ -203,10 +203,12 @@ class JointCurve(SmoothEffect):
     family = "angle"
     sized_by = "curve_size_rad"
     entry = JointMotion()
-    constants = (Setting("curve_size_rad", "range", 2e-4, 0.0, 1.0),
-                 Setting("curve_length_rad", "range", 0.3, 1e-3, 100.0),
-                 Setting("curve_low_rad", "range", -math.pi, -100.0, 100.0),
-                 Setting("curve_high_rad", "range", math.pi, -100.0, 100.0))  # fmt: skip
+    constants = (
+        Setting("curve_size_rad", "range", 2e-4, 0.0, 1.0),
+        Setting("curve_length_rad", "range", 0.3, 1e-3, 100.0),
+        Setting("curve_low_rad", "range", -math.pi, -100.0, 100.0),
+        Setting("curve_high_rad", "range", math.pi, -100.0, 100.0),
+    )
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
         return (
@@ -251,10 +253,12 @@ class ResidualField(AnyMotion, SmoothEffect):
         found: list[Setting] = []
         for name in (*turning_joints(chain), "time"):
             half, wide = (3600.0, 1e9) if name == "time" else (math.pi, 100.0)
-            found += [Setting(f"field_{name}_size", "range", 0.0, 0.0, 1.0),
-                      Setting(f"field_{name}_length", "range", half / 3, 1e-3, wide),
-                      Setting(f"field_{name}_low", "range", -half, -wide, wide),
-                      Setting(f"field_{name}_high", "range", half, -wide, wide)]  # fmt: skip
+            found += [
+                Setting(f"field_{name}_size", "range", 0.0, 0.0, 1.0),
+                Setting(f"field_{name}_length", "range", half / 3, 1e-3, wide),
+                Setting(f"field_{name}_low", "range", -half, -wide, wide),
+                Setting(f"field_{name}_high", "range", half, -wide, wide),
+            ]
         return tuple(found)
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
@@ -293,8 +297,10 @@ class ResidualStep(AnyMotion, Jump):
     together = True
     family = "time"
     sized_by = "step_size"
-    constants = (replace(JUMP_TIME, key="step_time_s"),
-                 Setting("step_size", "range", 1e-4, 0.0, 1.0))  # fmt: skip
+    constants = (
+        replace(JUMP_TIME, key="step_time_s"),
+        Setting("step_size", "range", 1e-4, 0.0, 1.0),
+    )
 
     def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
         return {f"step_{k}": unit for k, unit in enumerate(self.entry_at(place).units, start=1)}
@@ -313,8 +319,10 @@ class JointResponse(TorqueEffect):
     count: ClassVar[int]
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return (Setting(self.sized_by, "range", 1e-4, 0.0, 1.0),
-                Setting(f"{self.name}_Nm", "range", 100.0, 1e-9, 1e9))  # fmt: skip
+        return (
+            Setting(self.sized_by, "range", 1e-4, 0.0, 1.0),
+            Setting(f"{self.name}_Nm", "range", 100.0, 1e-9, 1e9),
+        )
 
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
         """φ (count,) at u and a."""
@@ -392,9 +400,11 @@ class LoadResponse(LoadedEffect):
     stage = "compliance"
     family = "load"
     sized_by = "load_response_size"
-    constants = (Setting(sized_by, "range", 1e-4, 0.0, 1.0),
-                 Setting("load_response_N", "range", 1000.0, 1e-9, 1e9),
-                 Setting("load_response_Nm", "range", 1000.0, 1e-9, 1e9))  # fmt: skip
+    constants = (
+        Setting(sized_by, "range", 1e-4, 0.0, 1.0),
+        Setting("load_response_N", "range", 1000.0, 1e-9, 1e9),
+        Setting("load_response_Nm", "range", 1000.0, 1e-9, 1e9),
+    )
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return ("base", *links(chain))

@@ -68,8 +68,10 @@ class PayloadError(Effect):
     formats = ("elastic",)
     remedy = "weigh the load and measure where it hangs"
     needs = ("load",)
-    unknowns = (ParameterSpec("payload_scale", "1", 0.0, 0.02),
-                *(ParameterSpec(f"load_point_{k}", "m", 0.0, 0.01) for k in "xyz"))  # fmt: skip
+    unknowns = (
+        ParameterSpec("payload_scale", "1", 0.0, 0.02),
+        *(ParameterSpec(f"load_point_{k}", "m", 0.0, 0.01) for k in "xyz"),
+    )
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:
         force, T = arm.input("force", 3), arm.T_tracker_flange
@@ -139,8 +141,10 @@ class LinkMassError(Effect):
         body = chain.masses[index(place)]
         share = 0.1 if cell.model.link_gravity else 1.0
         moment = body.mass * (share * float(np.linalg.norm(body.com)) + DISPLACED)
-        return (ParameterSpec("mass_error", "kg", 0.0, share * body.mass),
-                *(ParameterSpec(f"moment_{k}", "kg*m", 0.0, moment) for k in "xyz"))  # fmt: skip
+        return (
+            ParameterSpec("mass_error", "kg", 0.0, share * body.mass),
+            *(ParameterSpec(f"moment_{k}", "kg*m", 0.0, moment) for k in "xyz"),
+        )
 
     def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
         reason = ""
@@ -161,8 +165,12 @@ GEOMETRY = (
     "compensator_anchor_x", "compensator_anchor_y", "compensator_arm", "compensator_free_length",
 )  # fmt: skip
 # Rough geometry of a KR 270 compensator: an example to start from, to be identified.
-EXAMPLE: dict[str, Any] = {"stiffness_N_per_m": 0.0, "anchor_m": (0.686, 0.120), "arm_m": 0.185,
-                           "free_length_m": 0.458}  # fmt: skip
+EXAMPLE: dict[str, Any] = {
+    "stiffness_N_per_m": 0.0,
+    "anchor_m": (0.686, 0.120),
+    "arm_m": 0.185,
+    "free_length_m": 0.458,
+}
 # Geometries from which an unknown compensator is sought.  Only its shape counts, the angle of the
 # anchor, the arm and the free length over the anchor's distance a: sizes trade with the stiffness.
 ANCHOR_SHARE = 0.3  # of the length of the joint's link
@@ -214,8 +222,10 @@ class GravityCompensator(Effect):
         stiffness = float(given["stiffness_N_per_m"])
         sizes = *given["anchor_m"], given["arm_m"], given["free_length_m"]
         shape = zip(GEOMETRY, sizes, strict=True)
-        return (ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or None),
-                *(ParameterSpec(key, "m", float(value), 1e-2) for key, value in shape))  # fmt: skip
+        return (
+            ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or None),
+            *(ParameterSpec(key, "m", float(value), 1e-2) for key, value in shape),
+        )
 
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         if cell.model.nominal.gravity_compensator is not None:
